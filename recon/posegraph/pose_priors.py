@@ -123,51 +123,32 @@ def without_fixes(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]
 
 
 def averaged(node: Node, left: Node) -> PosePrior:
-    """The prior of a node that also speaks for the one before it, which is left out."""
-    return _averaged_altitudes(_averaged_fix(node, left), left.prior)
-
-
-def _averaged_fix(node: Node, left: Node) -> PosePrior:
-    """The node's prior with the mean of both fixes, which is the fix of the mean place; with
-    that of ``left`` where it has none."""
+    """The prior of a node that also speaks for the one before it, which is left out: with the mean
+    of both fixes, which is the fix of the mean place, and of the receiver's own altitudes."""
     one, other = node.prior, left.prior
     if other.position_m is None or other.sigma_position_m is None:
         return one
-    share, position_m = left.weight / (left.weight + node.weight), one.position_m
-    if position_m is None or one.sigma_position_m is None:
-        one = replace(
-            one,
-            sigma_position_m=other.sigma_position_m,
-            gnss_minus_baro_m=None,
-            gnss_minus_baro_fixes=0,
-        )
-        share, position_m = 1.0, other.position_m
-    elif np.any(other.sigma_position_m > MAX_WORSE * one.sigma_position_m):
+    share = left.weight / (left.weight + node.weight)
+    fix_m, sigma_m = one.position_m, one.sigma_position_m
+    own_m, own, others_m, others = (
+        one.gnss_minus_baro_m, one.gnss_minus_baro_fixes,
+        other.gnss_minus_baro_m, other.gnss_minus_baro_fixes,
+    )  # fmt: skip
+    if fix_m is None or sigma_m is None:
+        share, fix_m, sigma_m = 1.0, other.position_m, other.sigma_position_m
+        one = replace(one, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
+    elif own_m is not None and others_m is not None and others > 0:
+        mean_m = (own_m * own + others_m * others) / (own + others)
+        one = replace(one, gnss_minus_baro_m=mean_m, gnss_minus_baro_fixes=own + others)
+    if np.any(other.sigma_position_m > MAX_WORSE * sigma_m):
         return one
     place = node.place_of_fix + share * (left.place_of_fix - node.place_of_fix)
     return replace(
         one,
-        position_m=position_m + share * (other.position_m - position_m),
+        position_m=fix_m + share * (other.position_m - fix_m),
+        sigma_position_m=sigma_m,
         fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
     )
-
-
-def _averaged_altitudes(prior: PosePrior, left: PosePrior) -> PosePrior:
-    """The prior with both means of the receiver's own altitude, weighed by their fixes."""
-    if (
-        left.gnss_minus_baro_m is None
-        or left.gnss_minus_baro_fixes == 0
-        or left.sigma_position_m is None
-    ):
-        return prior
-    if prior.gnss_minus_baro_m is None or prior.sigma_position_m is None:
-        return prior
-    fixes = prior.gnss_minus_baro_fixes + left.gnss_minus_baro_fixes
-    mean = (
-        prior.gnss_minus_baro_m * prior.gnss_minus_baro_fixes
-        + left.gnss_minus_baro_m * left.gnss_minus_baro_fixes
-    ) / fixes
-    return replace(prior, gnss_minus_baro_m=mean, gnss_minus_baro_fixes=fixes)
 
 
 MAX_GAP_S = 3.0
