@@ -8,7 +8,7 @@ Gauss-Newton over the readings of docs/pose-graph.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,9 +19,8 @@ from recon.posegraph.alignment_readings import (
     RATE_S,
     UNKNOWNS,
     USUAL_RATE_M_S,
+    Alignment,
     AlignmentReadings,
-    AlignmentState,
-    Heights,
     ReadingNoise,
 )
 from recon.posegraph.ground_heights import GUESSED_SHARE, INDEPENDENT_HEIGHTS
@@ -39,7 +38,7 @@ from recon.posegraph.sensor_noise import (
     drift_noise,
     gauss_markov_noise,
 )
-from recon.similarity import Similarity, umeyama
+from recon.similarity import umeyama
 from recon.types import F64
 
 HUBER = 2.5
@@ -68,35 +67,6 @@ STEP_SHARE = 0.002
 
 MIN_WALK = 0.02
 """Sigma that no integrated velocity is better than, m / sqrt(s)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Alignment(Similarity):
-    """``x_world = scale * R @ x_odom + t``; covariance of (rotation, translation, log scale)."""
-
-    covariance: F64  # (7, 7)
-    sources: tuple[str, ...] = ()
-    noise: ReadingNoise | None = None  # as measured by the fit; None without one
-    sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
-    sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
-    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns assumed views
-    drift_m: float = 0.0  # by which altitudes are too high in the end, and too low at first
-    span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
-    heights: Heights | None = None  # where the noise of fixes is known
-    bend_rad: float = 0.0  # sigma of a part of the track against its mean, as vision's turns add up
-    lean: F64 | None = None  # (6, 6) of a left perturbation that tilts all; None: level is known
-
-    @property
-    def sigma_scale(self) -> float:
-        """Relative 1-sigma uncertainty of the scale."""
-        return float(np.sqrt(self.covariance[6, 6]))
-
-    @property
-    def sigma_lean_rad(self) -> float | None:
-        """1-sigma uncertainty of what is level somewhere, about the axis where it is largest."""
-        if self.lean is None:
-            return None
-        return float(np.sqrt(np.linalg.eigvalsh(self.lean[:2, :2])[-1] + self.bend_rad**2))
 
 
 def fit(
@@ -151,10 +121,9 @@ def fit(
         covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.claimed), axis=0))
     if len(readings.fix) and fix_s > 0:
         mean, counted = noise.of_mean(readings.claimed, readings.fix_s, fix_s)
-    at = best.at
-    similarity = Alignment(
-        float(np.exp(at.log_scale)), at.R, at.t, covariance, _sources(readings), noise, mean,
-        counted, at.mount, at.drift, readings.span_s, heights,
+    similarity = replace(
+        best.at, covariance=covariance, sources=_sources(readings), noise=noise, sigma_fixes=mean,
+        sigma_counted=counted, span_s=readings.span_s, heights=heights,
     )  # fmt: skip
     views = [a.prior for a in usable if a.prior.R_world_camera is not None]
     if any(v.sigma_tilt_rad < ASSUMED_TILT_RAD for v in views) or not len(readings.fix):
@@ -172,7 +141,7 @@ def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
 
 
 def _measured(
-    nodes: Sequence[Node], start: AlignmentState, bias_tau_s: tuple[float, float], slow_share: float
+    nodes: Sequence[Node], start: Alignment, bias_tau_s: tuple[float, float], slow_share: float
 ) -> ReadingNoise:
     """The noise of fixes and of velocities, each estimated from residuals against a fit of that
     sensor and the attitudes' tilt alone: a compass that is off would look like a drift."""
@@ -204,7 +173,7 @@ def _measured(
 
 
 def _of_fixes(
-    fixes: AlignmentReadings, at: AlignmentState, bias_tau_s: tuple[float, float], slow_share: float
+    fixes: AlignmentReadings, at: Alignment, bias_tau_s: tuple[float, float], slow_share: float
 ) -> ReadingNoise:
     """The noise of fixes and of assumed views, by their residuals to a track.
 
@@ -234,7 +203,7 @@ def _of_fixes(
     least = 1.0 if is_claimed else MIN_BIAS
     reach = across.reach(flat, min(least, slow_share))
     span_s = float(np.ptp(fixes.fix_s))
-    most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift)
+    most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift_m)
     flat_s, high_s = bias_time_constant_s(most, fix_s), bias_time_constant_s(high, fix_s)
     vertical = along.bounded(high, high_s, MIN_BIAS * drift)
     return ReadingNoise(
@@ -291,14 +260,14 @@ def scales(nodes: Sequence[Node], at: Alignment) -> tuple[Scale | None, Scale | 
 class _Solution:
     """The best state with its (UNKNOWNS, UNKNOWNS) information and its robust cost."""
 
-    at: AlignmentState
+    at: Alignment
     H: F64
     cost: float
     residuals: F64  # (M,) whitened, of the readings
     kept: F64  # (groups,) 0 for what is left out
 
 
-def _solve(readings: AlignmentReadings, at: AlignmentState, settled: float) -> _Solution:
+def _solve(readings: AlignmentReadings, at: Alignment, settled: float) -> _Solution:
     """Gauss-Newton with Huber's weights, until a step of ``settled`` sigmas."""
     group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
     H, cost, extra = np.eye(UNKNOWNS), np.inf, np.zeros((2, len(readings.fix)))
@@ -326,7 +295,7 @@ def _solve(readings: AlignmentReadings, at: AlignmentState, settled: float) -> _
     return _Solution(_centred(readings, at, weight), H, cost, r, kept)
 
 
-def _centred(readings: AlignmentReadings, at: AlignmentState, weight: F64) -> AlignmentState:
+def _centred(readings: AlignmentReadings, at: Alignment, weight: F64) -> Alignment:
     """The state whose track lies in the mean of the fixes by ``weight`` (groups,), so that their
     mean error is its shift: what is best for a wander's slope rests on the first and last."""
     if not len(readings.fix):
@@ -345,7 +314,7 @@ def _leave_out(readings: AlignmentReadings, norms: F64, kept: F64) -> bool:
     return not kept.all()
 
 
-def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[AlignmentState]:
+def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[Alignment]:
     """To begin with: by the attitude, and by the track of the fixes, which alone determines the
     heading when the compass is far off or there is none."""
     R = np.eye(3)
@@ -354,15 +323,15 @@ def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[Alignmen
             R = a.prior.R_world_camera @ a.T_odom_camera[:3, :3].T
             break
     if not len(readings.fix):
-        return [AlignmentState(R, -R @ nodes[0].T_odom_camera[:3, 3], 0.0)]
+        return [Alignment(1.0, R, -R @ nodes[0].T_odom_camera[:3, 3])]
     x = readings.x @ R.T
-    starts = [AlignmentState(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
+    starts = [Alignment(1.0, R, np.asarray(np.median(readings.fix - x, axis=0)))]
     if len(x) >= 4:
         weight = 1.0 / np.mean(readings.claimed**2, axis=1)
         found = umeyama(x, readings.fix, weight, is_level=True)
         if found is not None and found.scale > 0:
             shift = np.asarray(np.median(readings.fix - found.scale * x @ found.R.T, axis=0))
-            starts.append(AlignmentState(found.R @ R, shift, float(np.log(found.scale))))
+            starts.append(Alignment(found.scale, found.R @ R, shift))
     return starts
 
 

@@ -18,6 +18,7 @@ from recon.posegraph.ground_heights import GUESSED_SHARE, UNMEASURED_HEIGHTS, he
 from recon.posegraph.pose_priors import MIN_FIX_M, has_fix
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S, Noise, bias_time_constant_s, inflation
+from recon.similarity import Similarity
 from recon.types import F64, PosePrior
 
 BIAS_SHARE = 0.6
@@ -115,21 +116,40 @@ class ReadingNoise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AlignmentState:
-    """A similarity, and the errors that readings have in common."""
+class Alignment(Similarity):
+    """``x_world = scale * R @ x_odom + t``; covariance of (rotation, translation, log scale)."""
 
-    R: F64
-    t: F64
-    log_scale: float
-    mount: F64 = field(default_factory=lambda: np.zeros(3))
-    drift: float = 0.0
+    covariance: F64 = field(default_factory=lambda: np.eye(7))
+    sources: tuple[str, ...] = ()
+    noise: ReadingNoise | None = None  # as measured by the fit; None without one
+    sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
+    sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
+    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns assumed views
+    drift_m: float = 0.0  # by which altitudes are too high in the end, and too low at first
+    span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
+    heights: Heights | None = None  # where the noise of fixes is known
+    bend_rad: float = 0.0  # sigma of a part of the track against its mean, as vision's turns add up
+    lean: F64 | None = None  # (6, 6) of a left perturbation that tilts all; None: level is known
 
-    def moved(self, step: F64) -> AlignmentState:
-        """The state after a step (UNKNOWNS,)."""
-        return AlignmentState(
-            se3.so3_exp(step[:3]) @ self.R, self.t + step[3:6], self.log_scale + float(step[6]),
-            self.mount + step[7:10], self.drift + float(step[10]),
+    def moved(self, step: F64) -> Alignment:
+        """The same after a step (UNKNOWNS,) of the fit."""
+        return replace(
+            self, scale=self.scale * float(np.exp(step[6])), R=se3.so3_exp(step[:3]) @ self.R,
+            t=self.t + step[3:6], mount_rad=self.mount_rad + step[7:10],
+            drift_m=self.drift_m + float(step[10]),
         )  # fmt: skip
+
+    @property
+    def sigma_scale(self) -> float:
+        """Relative 1-sigma uncertainty of the scale."""
+        return float(np.sqrt(self.covariance[6, 6]))
+
+    @property
+    def sigma_lean_rad(self) -> float | None:
+        """1-sigma uncertainty of what is level somewhere, about the axis where it is largest."""
+        if self.lean is None:
+            return None
+        return float(np.sqrt(np.linalg.eigvalsh(self.lean[:2, :2])[-1] + self.bend_rad**2))
 
 
 class AlignmentReadings:
@@ -225,28 +245,28 @@ class AlignmentReadings:
         """(m,) times of the fixes, -1 to 1."""
         return from_middle(self.fix_s, *self.span_s)
 
-    def heights(self, at: AlignmentState, H: F64, covariance: F64) -> Heights:
+    def heights(self, at: Alignment, H: F64, covariance: F64) -> Heights:
         """What the fixes tell about the mean height; ``covariance`` (7, 7) is that of the fit."""
-        east, north, up = np.exp(at.log_scale) * at.R @ self.x.mean(axis=0)
+        east, north, up = at.scale * at.R @ self.x.mean(axis=0)
         of_mean = np.array([north, -east, 0.0, 0.0, 0.0, 1.0, up])
         sigma_m, time_s = float(np.sqrt(of_mean @ covariance @ of_mean)), float(self.fix_s.mean())
         if self.is_height_claimed:
             return sigma_m, time_s, 0.0
         sigma_drift_m = float(np.sqrt(np.linalg.inv(H)[10, 10]))
         _, half_s = self.span_s
-        return sigma_m, time_s, float(np.hypot(at.drift / half_s, sigma_drift_m / half_s))
+        return sigma_m, time_s, float(np.hypot(at.drift_m / half_s, sigma_drift_m / half_s))
 
-    def linearised(self, at: AlignmentState) -> tuple[F64, F64]:
+    def linearised(self, at: Alignment) -> tuple[F64, F64]:
         """Whitened residuals (M,) and Jacobian (M, UNKNOWNS)."""
         fix, way = self.placed(at), self.moved(at)
         turn, of_mount = self.turned(at)
         J = self._J.copy()
-        drifted = np.outer(self.along * at.drift, [0.0, 0.0, 1.0])
+        drifted = np.outer(self.along * at.drift_m, [0.0, 0.0, 1.0])
         y = np.concatenate([fix + self.fix - drifted - at.t, way + self.way])
         of = J[self._scaled].reshape(-1, 3, UNKNOWNS)
         of[:, :, :3], of[:, :, 6] = -se3.hat(y), y
         J[: self._turned, 7:10] = of_mount.reshape(-1, 3)
-        height, common = at.log_scale - self.log_ratio, np.r_[at.mount, at.drift]
+        height, common = np.log(at.scale) - self.log_ratio, np.r_[at.mount_rad, at.drift_m]
         r = np.concatenate([turn.ravel(), fix.ravel(), way.ravel(), height, common])
         return r * self._whitening, J * self._whitening[:, None]
 
@@ -297,16 +317,16 @@ class AlignmentReadings:
         weighted = self.weighted(r[:, None], kept, known)[:, 0]
         return float(r[self._rows] @ weighted[self._rows]) / max(free, 1.0)
 
-    def placed(self, at: AlignmentState) -> F64:
+    def placed(self, at: Alignment) -> F64:
         """(m, 3) m from the fixes, without their drift, to where the similarity has them."""
-        placed = np.exp(at.log_scale) * self.x @ at.R.T + at.t
-        return np.asarray(placed + np.outer(self.along * at.drift, [0.0, 0.0, 1.0]) - self.fix)
+        placed = at.scale * self.x @ at.R.T + at.t
+        return np.asarray(placed + np.outer(self.along * at.drift_m, [0.0, 0.0, 1.0]) - self.fix)
 
-    def moved(self, at: AlignmentState) -> F64:
+    def moved(self, at: Alignment) -> F64:
         """(k, 3) m from ways by velocity to those by vision."""
-        return np.asarray(np.exp(at.log_scale) * self.step @ at.R.T - self.way)
+        return np.asarray(at.scale * self.step @ at.R.T - self.way)
 
-    def turned(self, at: AlignmentState) -> tuple[F64, F64]:
+    def turned(self, at: Alignment) -> tuple[F64, F64]:
         """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone.
 
         And (n, 3, 3) how they change with the mount.
@@ -315,7 +335,7 @@ class AlignmentReadings:
         if n == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         seen, R_prior = at.R @ self.R_odom, self.R_prior.copy()
-        R_prior[self.is_assumed] = R_prior[self.is_assumed] @ se3.so3_exp(at.mount)
+        R_prior[self.is_assumed] = R_prior[self.is_assumed] @ se3.so3_exp(at.mount_rad)
         turn = se3.each_so3_log(seen @ R_prior.transpose(0, 2, 1))
         up = np.einsum("nij,nj->ni", seen, R_prior[:, 2])  # where the prior's up points now
         tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(n)])

@@ -9,8 +9,8 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph import alignment
-from recon.posegraph.alignment import Alignment, Scale
-from recon.posegraph.alignment_readings import ReadingNoise
+from recon.posegraph.alignment import Scale
+from recon.posegraph.alignment_readings import Alignment, ReadingNoise
 from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_offsets import Constants, constants, with_offsets
@@ -68,7 +68,7 @@ class Segment:
         first = self.nodes[0]
         R = first.prior.R_world_camera
         turn = np.eye(3) if R is None else R @ first.T_odom_camera[:3, :3].T
-        return Alignment(1.0, turn, np.zeros(3), np.eye(7))
+        return Alignment(1.0, turn, np.zeros(3))
 
     @property
     def noise(self) -> ReadingNoise | None:
@@ -183,9 +183,9 @@ class Segments:
     def tie(self, number: int, scale: float, R: F64, t: F64) -> None:
         """Place a segment by a loop, for good."""
         segment = self._all[number]
-        before = segment.similarity
-        covariance = np.eye(7) if before is None else before.covariance
-        placed = Alignment(scale, R, t, covariance, () if before is None else before.sources)
+        placed, before = Alignment(scale, R, t), segment.similarity
+        if before is not None:
+            placed = replace(placed, covariance=before.covariance, sources=before.sources)
         known = (found for _, found in self._placed() if found.sigma_fixes is not None)
         other = next(known, placed)  # one receiver places all that loops join
         segment.similarity = replace(

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment import Alignment
-from recon.posegraph.alignment_readings import from_middle
+from recon.posegraph.alignment_readings import Alignment, from_middle
 from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S

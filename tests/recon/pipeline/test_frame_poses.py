@@ -13,7 +13,7 @@ from recon import se3
 from recon.pipeline.config import untimed
 from recon.pipeline.frame_poses import FramePoses, pose_at
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
-from recon.posegraph.alignment import Alignment
+from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import sigma_m
 from recon.tracking.frame import RelativePose

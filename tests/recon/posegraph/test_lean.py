@@ -9,7 +9,8 @@ import pytest
 from flown_track import node
 
 from recon import se3
-from recon.posegraph.alignment import Alignment, fit
+from recon.posegraph.alignment import fit
+from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD, LEVEL_SIGMA_RAD
 from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory

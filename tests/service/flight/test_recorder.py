@@ -14,7 +14,8 @@ import pytest
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
-from recon.posegraph.alignment import Alignment, Scale
+from recon.posegraph.alignment import Scale
+from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
 from recon.poses import sigma_m

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph import pieces
-from recon.posegraph.alignment import Alignment
+from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.records import Loop, PoseGraphConfig
 from recon.posegraph.segments import Segment, Segments
 from recon.types import F64, PosePrior
