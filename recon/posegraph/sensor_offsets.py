@@ -132,54 +132,33 @@ def boresight(
     Attitudes err together over ``bias_tau_s``, so all of them count as
     1 + span / (2 bias_tau_s) readings.
     """
-    count = sum(len(R_odom) for R_odom, *_ in stretches)
-    if count == 0:
+    if not stretches:
         return Constants()
-    share = min(1.0, (1.0 + span_s / (2.0 * max(bias_tau_s, 1e-3))) / count)
-    turn, H, norms = np.zeros(3), np.eye(3), np.zeros(0)
-    frames = [_mean_frame(s) for s in stretches]
+    R_odom, R_reported, sigma = (np.concatenate(c) for c in zip(*stretches, strict=True))
+    of = np.repeat(np.arange(len(stretches)), [len(R) for R, *_ in stretches])
+    share = min(1.0, (1.0 + span_s / (2.0 * max(bias_tau_s, 1e-3))) / len(of))
+    each = R_reported @ R_odom.transpose(0, 2, 1)
+    frames = np.array([se3.nearest_rotation(each[of == k].sum(axis=0)) for k in range(of[-1] + 1)])
+    turn, known = np.zeros(3), np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
+    prior = np.r_[np.full(3, SIGMA_RAD**-2.0), np.full(3 * len(frames), 1e-9)]
+    of_frames = np.kron(np.eye(len(frames))[of], np.eye(3)).reshape(len(of), 3, -1)
     for _ in range(ROUNDS):
-        H, g, all_norms = np.eye(3) / SIGMA_RAD**2, -turn / SIGMA_RAD**2, []
-        for k, stretch in enumerate(stretches):
-            frames[k], S, s, norm = _stretch(stretch, frames[k], turn)
-            H, g = H + share * S, g + share * s
-            all_norms.append(norm)
-        norms = np.concatenate(all_norms)
-        step = np.linalg.solve(H, g)
-        turn = turn + step
-        length = float(np.linalg.norm(turn))
-        turn *= min(1.0, BOUND_RAD / max(length, 1e-12))
+        Q = R_reported @ se3.so3_exp(turn)
+        r = se3.each_so3_log(frames[of] @ R_odom @ Q.transpose(0, 2, 1))
+        norms = np.sqrt(np.sum(known * r**2, axis=1))
+        info = share * known * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))[:, None]
+        J = np.concatenate([-Q, of_frames], axis=2).reshape(-1, len(prior))
+        W = J * info.reshape(-1, 1)
+        H = W.T @ J + np.diag(prior)
+        step = np.linalg.solve(H, -W.T @ r.ravel() - prior * np.pad(turn, (0, 3 * len(frames))))
+        frames = se3.each_so3_exp(step[3:].reshape(-1, 3)) @ frames
+        turn = turn + step[:3]
+        turn *= min(1.0, BOUND_RAD / max(float(np.linalg.norm(turn)), 1e-12))
         if np.abs(step).max() < 1e-6:
             break
     if float(np.median(norms)) > WILD:
         return Constants()
-    return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))))
-
-
-def _mean_frame(stretch: Turns) -> F64:
-    """(3, 3) a first rotation from the stretch's frame to the world."""
-    R_odom, R_reported, _ = stretch
-    turns = R_reported @ R_odom.transpose(0, 2, 1)
-    return se3.project_to_so3(se3.compose(turns.mean(axis=0), np.zeros(3)))[:3, :3]
-
-
-def _stretch(stretch: Turns, frame: F64, turn: F64) -> tuple[F64, F64, F64, F64]:
-    """One Gauss-Newton step: the segment's better frame, its contribution to the boresight as
-    information (3, 3) and right-hand side (3,), and the whitened residuals (N,)."""
-    R_odom, R_reported, sigma = stretch
-    Q = R_reported @ se3.so3_exp(turn)
-    r = se3.each_so3_log(frame @ R_odom @ Q.transpose(0, 2, 1))
-    info = np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
-    norms = np.sqrt(np.sum(info * r**2, axis=1))
-    info = info * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))[:, None]
-    # r + w - Q b, with the frame's turn w eliminated.
-    A_ww = np.diag(info.sum(axis=0) + 1e-9)
-    A_wb = -np.einsum("ni,nij->ij", info, Q)
-    A_bb = np.einsum("nki,nk,nkj->ij", Q, info, Q)
-    g_w, g_b = -np.einsum("ni,ni->i", info, r), np.einsum("nki,nk->i", Q, info * r)
-    gain = A_wb.T @ np.linalg.inv(A_ww)
-    w = np.linalg.solve(A_ww, g_w)
-    return se3.so3_exp(w) @ frame, A_bb - gain @ A_wb, g_b - gain @ g_w, norms
+    return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))[:3]))
 
 
 MIN_INTERVALS = 3
