@@ -166,9 +166,10 @@ class Trajectory:
         37 mm and 130 mm; places err the same.
         """
         odom = self._table.rows["T_odom_camera"]
+        T_nodes_odom = se3.each_inverse(odom[self._nodes])
 
         def carried(node: I64) -> F64:
-            motion = np.linalg.inv(odom[self._nodes[node]]) @ odom[at]
+            motion = T_nodes_odom[node] @ odom[at]
             motion[:, :3, 3] *= scales[node, None]
             return np.asarray(T_nodes[node] @ motion)
 
