@@ -142,7 +142,7 @@ def kept_token(store: Path) -> str:
     path = store / TOKEN_FILE
     if not path.exists():
         with writing(path) as part:
-            part.touch(0o600)
+            part.touch(0o600, exist_ok=False)
             part.write_text(f"{secrets.token_urlsafe(24)}\n", encoding="ascii")
     return read_tokens(path)
 
@@ -172,19 +172,16 @@ class AuditLog:
         entry = {"time": now, "who": who, "from": where, "action": action, "status": status}
         entry |= {name: _short(value) for name, value in details.items()}
         line = json.dumps(entry) + "\n"
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
         try:
             with self._lock:
-                self._append(line.encode())
+                with open(os.open(self.path, flags, 0o600), "ab") as file:
+                    file.write(line.encode())
+                    size = file.tell()
+                if size > self._max_bytes:
+                    os.replace(self.path, self.path.with_name(f"{AUDIT_FILE}.1"))
         except OSError as error:
             log.warning("%s cannot be written (%s): %s", self.path, error.strerror, line.strip())
-
-    def _append(self, line: bytes) -> None:
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-        with open(os.open(self.path, flags, 0o600), "ab") as file:
-            file.write(line)
-            size = file.tell()
-        if size > self._max_bytes:
-            os.replace(self.path, self.path.with_name(f"{AUDIT_FILE}.1"))
 
 
 class Pace:
