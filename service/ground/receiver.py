@@ -285,12 +285,11 @@ class Receiver:
     def _take(self, key: str, payload: bytes) -> None:
         """Hand on what a drone has sent."""
         place = place_of(key)
-        one = self._drone(None if place is None else place[0])
-        if place is None or one is None:
-            return
-        if key.endswith("/head"):
+        if place is None:
+            self._dropped += 1
+        elif (one := self._drone(place[0])) is not None and key.endswith("/head"):
             one.put_head(place[1], payload)
-        else:
+        elif one is not None:
             one.put(drone.Item(place[1], payload))
 
     # The drones
@@ -304,23 +303,23 @@ class Receiver:
     def _busy(self) -> list[Drone]:
         return [one for one in self._all if not one.worker.is_done]
 
-    def _drone(self, name: str | None) -> Drone | None:
-        """A drone, its worker started if need be; None, and a message is dropped, without a name
-        and when there are too many."""
+    def _drone(self, name: str) -> Drone | None:
+        """A drone, its worker started if need be; None where one more is too many."""
         with self._lock:
-            found, now = self._drones.get(name or ""), time.monotonic()
+            found, now = self._drones.get(name), time.monotonic()
             if found is not None and not found.worker.is_done:
                 return found
-            if name is None or not self._has_room(now):
+            if not self._has_room(now):
                 self._dropped += 1
-                if name is not None and now - self._refused_at > REFUSAL_S:
+                if now - self._refused_at > REFUSAL_S:
                     self._refused_at = now
                     log.warning("%s is not received: %d drones are", name, self.limits.drones)
                 return None
+            self._sweep(now)
             one = self._drones.pop(name, None)
             if one is None:
-                store, station = self._config.store, self.name
-                one = Drone(drone.DroneReceiver(name, store, station, self.limits, now))
+                store = self._config.store
+                one = Drone(drone.DroneReceiver(name, store, self.name, self.limits, now))
             one.scans.heard_at = now
             one.worker = self.workers.start(f"drone {name}", partial(self._receive, one))
             self._drones[name] = one
@@ -329,11 +328,6 @@ class Receiver:
     def _has_room(self, now: float) -> bool:
         """Whether one more drone may come. If need be one that never had a scan and is silent makes
         way, else the silent one that brought least is told to end, with its scans."""
-        ended = [one for one in self._all if one.worker.is_done]
-        faulty = [one for one in ended if one.worker.has_failed or not one.scans.entries]
-        for one in (*faulty, *[one for one in ended if one not in faulty][:-MAX_RESTING]):
-            one.scans.close(now)  # what a fault left open
-            self._forget(one)
         busy = self._busy
         if len(busy) < self.limits.drones:
             return True
@@ -345,6 +339,14 @@ class Receiver:
         if silent:
             min(silent, key=lambda one: (one.brought, one.scans.heard_at)).worker.stop.set()
         return False
+
+    def _sweep(self, now: float) -> None:
+        """Forget strangers and faults that have ended, and the oldest of too many others."""
+        ended = [one for one in self._all if one.worker.is_done]
+        known = [one for one in ended if one.scans.entries and not one.worker.has_failed]
+        for one in set(ended) - set(known[-MAX_RESTING:]):
+            one.scans.close(now)  # what a fault left open
+            self._forget(one)
 
     def _forget(self, one: Drone) -> None:
         one.worker.stop.set()
