@@ -8,22 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
 
 from recon.camera_model import project
 from recon.parallel import parallel_for
-from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
 from recon.types import F32, F64, I32, I64, U8, Bool
 
 Rays = Callable[[F64, F64], F64]
 """Camera (3,) and unit directions (N, 3) to metres (N,) up to the mesh, infinite without a hit."""
-
-LARGEST_GRID = 4000
-"""Columns along a side of the grid of our own ray casting."""
 
 CANDIDATES = 6
 """Views kept per triangle, the finest."""
@@ -106,18 +102,22 @@ def look(
     return out
 
 
-def rays_onto(mesh: Mesh) -> Rays:
-    """Exact ray casting against ``mesh``: by Open3D (Embree), else by our own slower grid."""
-    try:
-        import open3d as o3d
-    except ImportError:
-        return _grid_rays(mesh)
-    scene = o3d.t.geometry.RaycastingScene()
+def ray_scene(vertices_m: F64, faces: I32 | I64) -> Any:
+    """Exact ray casting against triangles and distances to them, by Open3D (Embree)."""
+    import open3d as o3d
+
+    scene: Any = cast(Any, o3d.t.geometry).RaycastingScene()
     tensor: Any = o3d.core.Tensor
     scene.add_triangles(
-        tensor(np.ascontiguousarray(mesh.vertices_m, np.float32)),
-        tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+        tensor(np.ascontiguousarray(vertices_m, np.float32)),
+        tensor(np.ascontiguousarray(faces, np.uint32)),
     )
+    return scene
+
+
+def rays_onto(mesh: Mesh) -> Rays:
+    """Exact ray casting against ``mesh``."""
+    scene = ray_scene(mesh.vertices_m, mesh.faces)
 
     def reach(eye: F64, directions: F64) -> F64:
         rays: Any = np.empty((len(directions), 6), np.float32)
@@ -125,13 +125,6 @@ def rays_onto(mesh: Mesh) -> Rays:
         return np.asarray(scene.cast_rays(rays)["t_hit"].numpy())
 
     return reach
-
-
-def _grid_rays(mesh: Mesh) -> Rays:
-    side_m = float(np.ptp(mesh.vertices_m[:, :2], axis=0).max())
-    cell_m = max(2.0 * side_m / np.sqrt(len(mesh.faces)), side_m / LARGEST_GRID, 1e-6)
-    grid = triangle_grid.build(mesh.vertices_m, mesh.faces, cell_m)
-    return lambda eye, directions: np.nan_to_num(grid.cast(eye, directions)[0], nan=np.inf)
 
 
 def consistent(found: TriangleViews) -> TriangleViews:

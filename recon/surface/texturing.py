@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from scipy import sparse
 
-from recon.surface.meshing import Mesh
+from recon.surface.meshing import Mesh, edges
 from recon.surface.texture_atlas import Layout, Palette, lay_out, paint
 from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
 from recon.types import F32, F64, I32, U8
@@ -136,25 +136,14 @@ DAMPING = 0.5
 
 
 def face_neighbours(faces: I32) -> I32:
-    """(F, 3) the triangle across each edge (corner k to k + 1), -1 at the border.
-
-    Where more than two triangles share an edge, they are taken in pairs.
-    """
-    count = len(faces)
-    ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2).astype(np.int64)
-    key = ends.min(axis=1) * (int(faces.max(initial=0)) + 1) + ends.max(axis=1)
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(key[order][1:] == key[order][:-1])
-    if len(same):  # of three in a row take the first two
-        run = np.r_[True, np.diff(same) > 1]
-        position = np.arange(len(same)) - np.maximum.accumulate(
-            np.where(run, np.arange(len(same)), 0)
-        )
-        same = same[position % 2 == 0]
-    out = np.full(3 * count, -1, np.int32)
-    first, second = order[same], order[same + 1]
-    out[first], out[second] = second // 3, first // 3
-    return out.reshape(count, 3)
+    """(F, 3) the triangle across each edge (corner k to k + 1); -1 where not two share it."""
+    _, number, count = edges(faces)
+    order = np.argsort(number, axis=None, kind="stable")
+    first = (np.cumsum(count) - count)[count == 2]
+    one, other = order[first], order[first + 1]
+    out = np.full(3 * len(faces), -1, np.int32)
+    out[one], out[other] = other // 3, one // 3
+    return out.reshape(-1, 3)
 
 
 def choose(found: TriangleViews, neighbours: I32) -> I32:

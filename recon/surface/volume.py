@@ -157,7 +157,8 @@ def _voted(upper: Raster, ground_m: F32, depths: Sequence[DepthMap]) -> Volume:
 
 def _tiles(cells: F32) -> F32:
     """(Y, X, SIDE, SIDE) of (rows, cols)."""
-    return cells.reshape(cells.shape[0] // SIDE, SIDE, -1, SIDE).transpose(0, 2, 1, 3)
+    blocks = cells.reshape(cells.shape[0] // SIDE, SIDE, -1, SIDE)
+    return np.asarray(blocks.transpose(0, 2, 1, 3))
 
 
 def _blocks(lowest: I32, highest: I32) -> I32:
@@ -360,21 +361,13 @@ def _smoothed(vertices: F64, faces: I32) -> F64:
 def _measured(volume: Volume, vertices: F64) -> Bool:
     """(V,) whether images have voted for all voxels around each vertex: what only one side was
     seen of is guessed."""
-    at = (vertices - volume.origin_m) / volume.voxel_m
-    order = np.lexsort(volume.block.T)
-    low = volume.block.min(axis=0).astype(np.int64)
-    span = volume.block.max(axis=0) - low + 1
-
-    def key(block: I64) -> I64:
-        x, y, z = (block - low).T
-        return np.asarray((z * span[1] + y) * span[0] + x)
-
-    keys = key(volume.block[order].astype(np.int64))
+    at = np.floor((vertices - volume.origin_m) / volume.voxel_m).astype(np.int64)
+    low = volume.block.min(axis=0)
+    number: I32 = np.full(volume.block.max(axis=0) - low + 2, -1, np.int32)  # beyond stands none
+    number[tuple((volume.block - low).T)] = np.arange(len(volume.block))
     out = np.ones(len(vertices), np.bool_)
     for corner in np.ndindex(2, 2, 2):
-        voxel = np.floor(at).astype(np.int64) + corner
-        block, (i, j, k) = voxel // SIDE, (voxel % SIDE).T
-        n = np.clip(np.searchsorted(keys, key(block)), 0, len(keys) - 1)
-        held = (keys[n] == key(block)) & ((block >= low) & (block < low + span)).all(axis=1)
-        out &= held & (volume.weight[order[n], k, j, i] > 0.0)
+        place, (i, j, k) = (at + corner) // SIDE - low, ((at + corner) % SIDE).T
+        n = number[tuple(np.clip(place, -1, np.array(number.shape) - 1).T)]
+        out &= (n >= 0) & (volume.weight[n, k, j, i] > 0.0)
     return out

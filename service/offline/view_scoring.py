@@ -11,7 +11,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from recon import se3
 from recon.camera_model import Undistorter, rays, scaled
 from recon.surface.hole_filling import outlined
 from recon.surface.splats import COVERED, Splats, rendered
+from recon.surface.texture_views import ray_scene
 from recon.tracking import pnp
 from recon.tracking.sift_features import (
     FINE_MOST,
@@ -293,10 +294,7 @@ def by_rays(shown: Triangles, camera: Camera) -> Draw:
     import open3d as o3d
 
     core: Any = o3d.core
-    scene = cast(Any, o3d.t.geometry.RaycastingScene)()
-    scene.add_triangles(
-        core.Tensor(shown.vertices_m.astype(np.float32)), core.Tensor(shown.faces.astype(np.uint32))
-    )
+    scene = ray_scene(shown.vertices_m, shown.faces)
 
     def draw(T: F64) -> tuple[U8, Bool]:
         w, h = camera.size_px

@@ -7,14 +7,14 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TextIO, cast
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
 
 from recon.surface.meshing import Mesh, coarser, cut
 from recon.surface.raster import grid_over, rasterise
-from recon.surface.texture_views import TextureView, doubled_area
+from recon.surface.texture_views import TextureView, doubled_area, ray_scene
 from recon.surface.texturing import texture
 from recon.surface.volume import volume_mesh
 from recon.types import F64, U8
@@ -214,14 +214,9 @@ def _textured(
 def _error(fine: Mesh, level: TilePart) -> float:
     """What a level of detail is off by, in metres of a viewer's screen error: the distance of 95 %
     of the finest level's vertices, or its texels."""
-    import open3d as o3d
-
-    mesh, core = level.mesh, cast(Any, o3d.core)
-    scene = cast(Any, o3d.t.geometry.RaycastingScene)()
-    scene.add_triangles(
-        core.Tensor(mesh.vertices_m.astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32))
-    )
-    off_m = scene.compute_distance(core.Tensor(fine.vertices_m.astype(np.float32))).numpy()
+    mesh = level.mesh
+    places: Any = fine.vertices_m.astype(np.float32)
+    off_m = ray_scene(mesh.vertices_m, mesh.faces).compute_distance(places).numpy()
     assert mesh.uv is not None
     corners = mesh.vertices_m[mesh.faces]
     uv = mesh.uv[mesh.faces].astype(np.float64) * level.image.shape[1::-1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import product
 
 import numpy as np
@@ -67,28 +66,6 @@ def shown(textured: Mesh, atlas: U8) -> tuple[F64, F64]:
     uv = textured.uv[textured.faces].mean(axis=1)
     at = np.clip((uv * [w, h]).astype(int), 0, [w - 1, h - 1])
     return textured.vertices_m[textured.faces].mean(axis=1), atlas[at[:, 1], at[:, 0]].astype(float)
-
-
-@pytest.fixture
-def no_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine where ``import open3d`` fails."""
-    monkeypatch.setitem(sys.modules, "open3d", None)
-
-
-def test_without_open3d_the_same_views_see_the_same_triangles(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pytest.importorskip("open3d", exc_type=ImportError)
-    mesh = sheet(step_m=10.0)
-    views = [image(np.array([x, 0.0, 30.0])) for x in (6.0, -6.0)]
-    exact = look(mesh, views)
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    own = look(mesh, views)
-    assert (exact.view < 0).any() and (exact.view == own.view).mean() > 0.999
-
-
-def test_a_texture_without_open3d_shows_the_ground_where_it_is(no_open3d: None) -> None:
-    test_the_texture_shows_the_ground_where_it_is()
 
 
 def test_the_texture_shows_the_ground_where_it_is() -> None:
