@@ -318,7 +318,8 @@ class ImagesSource(CameraSource):
     def _times(self, tagged: list[Still], interval_s: float | None) -> tuple[list[int], int | None]:
         """(ns since the first still, UTC of the first still when known) of every still."""
         tags = [t for _, t in tagged]
-        unix = [utc_ns(t, clock_offset_ns(tags)) for t in tags]
+        offset_ns = clock_offset_ns(tags)
+        unix = [utc_ns(t, offset_ns) for t in tags]
         known = [t for t in unix if t is not None]
         if interval_s is None and len(known) == len(tags):
             return _from_first(spread(known, tags)), min(known)

@@ -316,7 +316,8 @@ def _survey(refined: dict[str, Any]) -> str:
     for role in ("control", "check"):
         s = refined.get(role)
         if s:
-            sums = [_rms(s[f"rms_h_{w}_m"], s[f"rms_v_{w}_m"]) for w in ("before", "after")]
+            apart_m = [(s[f"rms_h_{w}_m"], s[f"rms_v_{w}_m"]) for w in ("before", "after")]
+            sums = [", ".join(f"{m:.3f} m" for m in two if m is not None) for two in apart_m]
             rows.append([f"rms of {s['count']}", role, "", *sums, "horizontal, vertical"])
     header = ("point", "role", "marks", "map minus survey before: east, north, up, m", "after", "")
     return table(rows, header)
@@ -327,7 +328,3 @@ def _offset(values: Sequence[float | None] | None) -> str:
     if values is None or max(abs(v or 0.0) for v in values) > 1e4:
         return ""
     return "  ".join(f"{v:+.3f}" for v in values if v is not None)
-
-
-def _rms(flat_m: float, up_m: float | None) -> str:
-    return f"{flat_m:.3f} m" if up_m is None else f"{flat_m:.3f} m, {up_m:.3f} m"

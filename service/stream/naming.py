@@ -20,11 +20,6 @@ RUN = re.compile(r"(.+)\.([0-9a-f]{32})")
 """Name of a scan on the datalink: its own name, a dot, and its run."""
 
 
-def scan_name(scan_id: str, run_id: str) -> str:
-    """The scan's name on the datalink; two runs at the same time have different names."""
-    return f"{scan_id}.{run_id}" if run_id else scan_id
-
-
 def split_scan_name(name: str) -> tuple[str, str]:
     """Scan and run of a name; the run is empty for drones that do not send it."""
     found = RUN.fullmatch(name)

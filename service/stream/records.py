@@ -20,7 +20,6 @@ import numpy as np
 from recon import se3
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.stream import validity
-from service.stream.naming import scan_name
 from service.stream.validity import MAX_DEPTH_M, MAX_HEADER_BYTES, MIN_DEPTH_M
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "exif", "loop", "dead reckoning")
@@ -48,8 +47,8 @@ class ScanHeader:
 
     @property
     def name(self) -> str:
-        """The scan's name on the datalink and the radio."""
-        return scan_name(self.scan_id, self.run_id)
+        """The scan's name on the datalink and the radio; no two runs have the same."""
+        return f"{self.scan_id}.{self.run_id}" if self.run_id else self.scan_id
 
     @property
     def identity(self) -> tuple[str, str, str]:

@@ -215,13 +215,6 @@ class ScanStore:
             self.refused += len(sound) - len(kept)
             return self._put_chunks(kept)
 
-    def _add_row(self, row: tuple[Any, ...]) -> bool:
-        with self._lock:
-            if row[1] > 0 and not self._room(len(row[-1])):
-                self.refused += 1
-                return False
-            return self._put_chunks([row]) > 0
-
     def _put_chunks(self, rows: Sequence[tuple[Any, ...]]) -> int:
         sql = "INSERT OR IGNORE INTO chunks VALUES (?, ?, ?, ?, ?, ?, ?)"
         fresh = [row for row in rows if row[0] not in self._inventory.of(chunk_kind(row[1]))]
@@ -438,8 +431,13 @@ class ScanStore:
                 self._insert([(number, record, data)])
                 return True
         row = _image_row(number, data) if kind == "image" else _chunk_row(data)
-        is_named = row is not None and (row[0], chunk_kind(row[1])) == (number, kind)
-        return row is not None and is_named and self._add_row(row)
+        if row is None or (row[0], chunk_kind(row[1])) != (number, kind):
+            return False
+        with self._lock:
+            if row[1] > 0 and not self._room(len(row[-1])):
+                self.refused += 1
+                return False
+            return self._put_chunks([row]) > 0
 
     def _put_whole(self, kind: str, number: int, data: bytes) -> bool:
         with self._lock:
