@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recon import se3
+from recon.backends import Backend
+from recon.mapping.registration import IcpConfig, agreed_motion
 from recon.pipeline.config import Timing
 from recon.pipeline.views import StereoView
 from recon.posegraph.ground_heights import height_above, height_below
@@ -18,7 +20,7 @@ from recon.posegraph.pieces import apart
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
-from recon.types import F64, Array, DepthMap, Keyframe, Pose
+from recon.types import F64, Array, DepthMap, Keyframe, Pose, Verdict
 
 FARTHEST_M = 1e6
 """Maximum distance from the scan's origin."""
@@ -43,13 +45,17 @@ class KeyframeMap:
         self,
         trajectory: Trajectory,
         loops: LoopSearch | None,
+        backend: Backend,
         rejected: Counter[str],
         timing: Timing,
     ) -> None:
         self.trajectory, self._loops = trajectory, loops
-        self._count = self._levelled = 0  # keyframes, and those whose ground is taken as level
+        self._backend, self._icp = backend, IcpConfig()
+        self._levelled = 0  # keyframes whose ground is taken as level
         self._rejected, self._timing = rejected, timing
         self._newest = -1  # number of the last keyframe
+        self._depth: DepthMap | None = None  # its depth
+        self.verdicts: Counter[Verdict] = Counter()  # of ICP
 
     @property
     def graph(self) -> PoseGraph:
@@ -58,7 +64,7 @@ class KeyframeMap:
     @property
     def is_levelled(self) -> bool:
         """True when what is level follows from the ground: too many views are off the mount."""
-        return self._levelled > MAX_LEVELLED_SHARE * self._count
+        return self._levelled > MAX_LEVELLED_SHARE * self.graph.entered
 
     @property
     def held(self) -> dict[str, int]:
@@ -66,19 +72,16 @@ class KeyframeMap:
         views = 0 if self._loops is None else len(self._loops)
         return {"loop_views": views, "graph_keyframes": len(self.graph)}
 
-    def add(
-        self, view: StereoView, step: F64 | None, covariance: F64, depth: DepthMap | None
-    ) -> GraphUpdate:
-        """Append a view with what :class:`recon.pipeline.stages.Register` gives, and look for
-        loops."""
-        T_odom = view.image.T_odom_camera
+    def add(self, view: StereoView, depth: DepthMap | None) -> GraphUpdate:
+        """Append a view, by vision and by ICP of its depth onto that of the keyframe before, and
+        look for loops."""
+        T_odom, (step, covariance) = view.image.T_odom_camera, self._step(view, depth)
         T_chain = T_odom if step is None else self.trajectory.odom_pose(self._newest) @ step
         up = T_odom[2, :3]
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
         prior = levelled(view.prior, view.points)
-        self._newest = view.seq
-        self._count += 1
+        self._newest, self._depth = view.seq, depth
         self._levelled += prior is not view.prior
         self.trajectory.add(
             view.seq, view.segment, T_chain, prior, height, view.time_ns, covariance
@@ -95,6 +98,27 @@ class KeyframeMap:
         is_placed = self.graph.segments[view.segment].similarity is not None
         changed = self.trajectory.moved() if depth is not None else {}
         return GraphUpdate(pose, is_placed, is_plausible, changed)
+
+    def _step(self, view: StereoView, depth: DepthMap | None) -> tuple[F64 | None, F64]:
+        """The step (4, 4) from the keyframe before, None where its chain begins, and its covariance
+        (6, 6): vision's and ICP's, weighted by covariance; vision's alone where ICP contradicts it.
+
+        Lengths are in units of the odometry, the covariance of a left perturbation in the frame of
+        the camera before; without a step, of the pose itself.
+        """
+        covariance = view.covariance + np.diag([1e-4**2] * 3 + [0.005**2] * 3)
+        T_before = view.earlier.get(self._newest)
+        if T_before is None:
+            return None, covariance
+        step = se3.inverse(T_before) @ view.image.T_odom_camera
+        A = se3.adjoint(step)
+        covariance = A @ covariance @ A.T
+        if depth is None or self._depth is None:
+            return step, covariance
+        with self._timing("icp"):
+            found = self._backend.register(depth, self._depth, step, self._icp)
+        self.verdicts[found.verdict] += 1
+        return agreed_motion(step, covariance, found) or (step, covariance)
 
     def predicted(self, view: StereoView) -> tuple[F64, Pose] | None:
         """A view that is not added yet: T_odom_camera (4, 4) in its segment's chain, and its pose

@@ -25,7 +25,6 @@ from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.pipeline.stages import (
     DenseStereo,
-    Register,
     Undistort,
     keyframe_of,
     plausible_depth,
@@ -145,10 +144,9 @@ class Mapper:
             first = replace(stereo, min_base_to_height=FIRST_BASE_TO_HEIGHT, guided=False,
                             width_px=stereo.width_px // COARSER)  # fmt: skip
             self._first_stereo = DenseStereo(backend, first, dense, Counter(), None, untimed)
-        self.register = Register(backend, timing)
         trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
-        self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
+        self.keyframes = KeyframeMap(trajectory, loops, backend, self.rejected, timing)
         self.surface = SurfaceMap(
             float(camera.K[0, 0]), trajectory.similarities, config.resolution_m, new_map
         )
@@ -245,8 +243,7 @@ class Mapper:
             segments = self.keyframes.graph.segments
             depth = plausible_depth(view, depth, bgr, segments, self.rejected)
         self.stereo.learn(depth)  # how far the relief of the next pairs may reach
-        step, covariance = self.register(view, depth)  # ICP onto the keyframe before
-        update = self.keyframes.add(view, step, covariance, depth)  # pose graph
+        update = self.keyframes.add(view, depth)  # ICP onto the keyframe before, pose graph
         if depth is None or not update.is_plausible:
             return update
         with self._timing("map"):  # what is new

@@ -13,7 +13,6 @@ from recon import se3
 from recon.backends import Backend, DenseStages
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
-from recon.mapping.registration import IcpConfig, agreed_motion
 from recon.pipeline.config import CONTRADICTED, Timing
 from recon.pipeline.views import StereoView
 from recon.posegraph.segments import Segments
@@ -39,7 +38,6 @@ from recon.types import (
     Pose,
     RectifiedPair,
     StereoPair,
-    Verdict,
 )
 
 MAX_TRACKING_WIDTH_PX = 1280
@@ -236,38 +234,6 @@ def plausible_depth(
         return kept
     rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
     return None
-
-
-class Register:
-    """ICP of each view's depth onto that of the keyframe before."""
-
-    def __init__(self, backend: Backend, timing: Timing) -> None:
-        self._backend, self._config, self._timing = backend, IcpConfig(), timing
-        self._before: tuple[int, DepthMap | None] | None = None  # number and depth
-        self.verdicts: Counter[Verdict] = Counter()
-
-    def __call__(self, view: StereoView, depth: DepthMap | None) -> tuple[F64 | None, F64]:
-        """The step (4, 4) from the keyframe before, None where its chain begins, and its covariance
-        (6, 6): vision's and ICP's, weighted by covariance; vision's alone where ICP contradicts it.
-
-        Lengths are in units of the odometry, the covariance of a left perturbation in the frame of
-        the camera before; without a step, of the pose itself.
-        """
-        covariance = view.covariance + np.diag([1e-4**2] * 3 + [0.005**2] * 3)
-        before, self._before = self._before, (view.seq, depth)
-        T_before = view.earlier.get(before[0]) if before is not None else None
-        if before is None or T_before is None:
-            return None, covariance
-        step = se3.inverse(T_before) @ view.image.T_odom_camera
-        A = se3.adjoint(step)
-        covariance = A @ covariance @ A.T
-        if depth is None or before[1] is None:
-            return step, covariance
-        with self._timing("icp"):
-            found = self._backend.register(depth, before[1], step, self._config)
-        self.verdicts[found.verdict] += 1
-        agreed = agreed_motion(step, covariance, found)
-        return agreed or (step, covariance)
 
 
 def keyframe_of(

@@ -174,7 +174,7 @@ class Recorder:
             "stage_ms": {k: round(v, 2) for k, v in self.pipeline.stopwatch.mean_ms().items()},
             "refusals": dict(self.mapper.refusals()),
             "drops": self._drops(),
-            "registrations": {v.value: n for v, n in self.mapper.register.verdicts.items()},
+            "registrations": {v.value: n for v, n in self.mapper.keyframes.verdicts.items()},
         }
 
     def _drops(self) -> dict[str, int]:

@@ -10,6 +10,7 @@ import pytest
 from some_views import keyframe_at, view_at
 
 from recon import se3
+from recon.backends.cpu import CpuBackend
 from recon.pipeline.config import untimed
 from recon.pipeline.frame_poses import FramePoses, pose_at
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
@@ -27,7 +28,7 @@ def frame_at(seq: int, north_m: float) -> RelativePose:
 
 
 def empty() -> KeyframeMap:
-    return KeyframeMap(Trajectory(), None, Counter(), untimed)
+    return KeyframeMap(Trajectory(), None, CpuBackend(), Counter(), untimed)
 
 
 def following() -> Any:
@@ -113,7 +114,7 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     key = keyframe_at(3, some_pose())
     frame, view = (RelativePose(seq, 0, some_pose(), key) for seq in (7, 5))
     assert frames.place(PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
-    update = keyframes.add(view_at(5, view.T_odom_camera), None, np.eye(6), None)
+    update = keyframes.add(view_at(5, view.T_odom_camera), None)
     trajectory, known = keyframes.trajectory, keyframes.trajectory.pose(5)
     keyframes.trajectory = None
     fallback = pose_at(np.eye(4), np.full(3, 9.0), np.ones(3))
@@ -137,9 +138,7 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     key, fix = keyframe_at(3, np.eye(4)), np.array([20.0, -10.0, 50.0])
     prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
     view, frame = (RelativePose(seq, 0, some_pose(), key) for seq in (5, 7))
-    frames.add_view(
-        view, keyframes.add(view_at(5, view.T_odom_camera, prior=prior), None, np.eye(6), None)
-    )
+    frames.add_view(view, keyframes.add(view_at(5, view.T_odom_camera, prior=prior), None))
     in_flight = frames.place(prior, frame)
     keyframes.trajectory.moved(final=True)
     frames.finish()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any, cast
 from unittest.mock import Mock
 
@@ -12,10 +13,12 @@ from some_views import view_at
 from recon import se3
 from recon.backends import Backend
 from recon.pipeline.config import untimed
-from recon.pipeline.stages import Register
+from recon.pipeline.keyframe_map import KeyframeMap
+from recon.posegraph.trajectory import Trajectory
 from recon.types import DepthMap, Registration, Verdict
 
-DEPTH = cast(DepthMap, object())
+ONE = np.ones((2, 2), np.float32)
+DEPTH = DepthMap(ONE, ONE, np.ones((2, 2), np.uint8), np.eye(3), np.eye(4))
 STEP = se3.compose(np.eye(3), np.array([4.0, 0.0, 0.0]))
 
 
@@ -24,12 +27,13 @@ def step_with_icp(off_m: float) -> float:
     spread = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
     T = se3.compose(np.eye(3), np.array([4.0 + off_m, 0.0, 0.0]))
     found = Registration(T, spread, Verdict.CONVERGED, 0.1, 0.9, 3)
-    register = Register(cast(Any, Mock(Backend, **{"register.return_value": found})), untimed)
+    backend = cast(Any, Mock(Backend, **{"register.return_value": found}))
+    keyframes = KeyframeMap(Trajectory(), None, backend, Counter(), untimed)
     for seq, T_odom_camera in enumerate((np.eye(4), STEP)):
         view = view_at(seq, T_odom_camera, covariance=spread, earlier={0: np.eye(4)})
-        step, _ = register(view, DEPTH)
-    assert step is not None
-    return float(step[0, 3] - STEP[0, 3])
+        keyframes.add(view, DEPTH)
+    assert keyframes.verdicts == {Verdict.CONVERGED: 1}
+    return float(keyframes.trajectory.odom_pose(1)[0, 3] - STEP[0, 3])
 
 
 @pytest.mark.parametrize(("off_m", "taken_m"), [(0.03, 0.015), (0.5, 0.0)])

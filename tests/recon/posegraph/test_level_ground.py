@@ -11,6 +11,7 @@ import pytest
 from some_views import view_at
 
 from recon import se3
+from recon.backends.cpu import CpuBackend
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.pipeline.config import untimed
 from recon.pipeline.keyframe_map import KeyframeMap
@@ -74,10 +75,10 @@ def test_ground_without_a_plane_levels_nothing() -> None:
 
 @pytest.mark.parametrize(("steep", "is_levelled"), [(1, False), (2, False), (3, True), (10, True)])
 def test_a_few_steep_views_do_not_doubt_the_mount_of_all(steep: int, is_levelled: bool) -> None:
-    keyframes = KeyframeMap(Trajectory(), None, Counter(), untimed)
+    keyframes = KeyframeMap(Trajectory(), None, CpuBackend(), Counter(), untimed)
     for seq in range(10):
         R, T = looking(-40 if seq < steep else -90), np.eye(4)
         T[0, 3] = seq
         view = view_at(seq, T, prior=NADIR, points=ground_seen(R))
-        keyframes.add(view, None, np.eye(6), None)
+        keyframes.add(view, None)
     assert keyframes.is_levelled == is_levelled
