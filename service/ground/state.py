@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import threading
 import time
@@ -28,8 +27,6 @@ from service.progress import CancelledError, Progress
 from service.scans.coverage import LiveCoverage
 from service.stream.store import ScanStore
 from service.workers import Worker, Workers, guarded
-
-log = logging.getLogger(__name__)
 
 MAX_WAITING_JOBS = 20
 KEPT = 100
