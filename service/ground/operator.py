@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -197,17 +196,11 @@ class Operator:
     def request(self, number: int, name: str, component: int, wait_s: float) -> dict[str, Any]:
         """Request one message of a kind; empty when it does not arrive in time."""
         found: dict[str, Any] = {}
-        there = threading.Event()
-
-        def take(sender: int, fields: dict[str, Any]) -> None:
-            if sender == component:
-                found.update(fields)
-                there.set()
-
-        self.subscribe(name, take)
-        ack = self.command(REQUEST, component, (float(number),))
-        if ack.result == 0:
-            there.wait(wait_s)
+        self.subscribe(
+            name, lambda sender, fields: found.update(fields if sender == component else {})
+        )
+        if self.command(REQUEST, component, (float(number),)).result == 0:
+            _wait(lambda: bool(found), wait_s)
         return dict(found)
 
 
@@ -252,7 +245,7 @@ def order(operator: Operator, action: str, metres: float | None) -> dict[str, An
 
 
 def _wait(done: Callable[[], bool], limit_s: float = 0.5) -> None:
-    """Wait a moment for the words that come after a refusal."""
+    """Wait a moment for what comes after an answer, such as the words of a refusal."""
     deadline = time.monotonic() + limit_s
     while not done() and time.monotonic() < deadline:
         time.sleep(0.02)
