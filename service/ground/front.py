@@ -37,7 +37,7 @@ HANDSHAKE_S = 12.0
 ADMITTED = 2
 """Replies of Zenoh after which it has checked the other end: the second of TLS needs its
 certificate."""
-BLOCK_BYTES = 16_384
+BLOCK_BYTES = 32_768
 LOOK_S = 0.1
 BACKLOG = 512
 
