@@ -322,6 +322,7 @@ DEBUG_KEYS = {
 class Panel:
     title: str
     image: U8  # (h, w, 3) BGR
+    ends: tuple[str, ...] = ()  # of the colour scale
 
 
 def debug_path(folder: Path, seq: int) -> Path:
@@ -441,8 +442,9 @@ def coloured(title: str, values: Array, unit: str, colours: int = cv2.COLORMAP_T
     image[~known] = BACKGROUND
     share = 100.0 * float(known.mean())
     digits = 2 if unit else 0  # counts are whole
-    text = f"{title} {low:.{digits}f} to {high:.{digits}f} {unit}".rstrip()
-    return Panel(f"{text}, {share:.0f} % known", np.asarray(image, np.uint8))
+    ends = f"{low:.{digits}f}", f"{high:.{digits}f} {unit}".rstrip()
+    text = f"{title} {' to '.join(ends)}, {share:.0f} % known"
+    return Panel(text, np.asarray(image, np.uint8), ends)
 
 
 def sheet(panels: Sequence[Panel], heading: str) -> U8:

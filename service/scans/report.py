@@ -148,7 +148,7 @@ def _cover(
 def accuracy_words(summary: dict[str, Any]) -> list[str]:
     """Paragraphs on how accurate the map is, and what that rests on."""
     quality, refined = summary["quality"], summary.get("refinement") or {}
-    level, reasons = quality["trust"]["level"], quality["trust"]["reasons"]
+    level = quality["trust"]["level"]
     check, control = refined.get("check"), refined.get("control")
     out = []
     if check:
@@ -187,8 +187,6 @@ def accuracy_words(summary: dict[str, Any]) -> list[str]:
     scale = quality.get("scale_sigma")
     if scale is not None and level in ("georeferenced", "scaled"):
         out.append(f"Lengths are to scale within ± {100.0 * scale:.1f} % (1 sigma).")
-    if reasons:
-        out.append(f"Reservations: {'; '.join(reasons)}.")
     return out
 
 

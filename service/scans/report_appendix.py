@@ -113,13 +113,22 @@ def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
     views, sigma = _per_cell(cloud, cell)
     out = []
     for title, values, unit, colours in (
-        ("Stereo pairs that agree, maximum per cell:", views, "", cv2.COLORMAP_VIRIDIS),
-        ("Sigma, minimum per cell:", sigma, "m", cv2.COLORMAP_MAGMA),
+        ("Stereo pairs that agree, maximum per cell", views, "", cv2.COLORMAP_VIRIDIS),
+        ("Sigma, minimum per cell", sigma, "m", cv2.COLORMAP_MAGMA),
     ):
         panel = coloured(title, values, unit, colours)
-        caption = panel.title.rpartition(",")[0] or panel.title
-        out.append(figure(_png(panel.image), "image/png", caption + ", dark to light."))
+        scale = _colour_bar(colours, *panel.ends) if panel.ends else ": no data"
+        out.append(figure(_png(panel.image), "image/png", title, scale))
     return out
+
+
+def _colour_bar(colours: int, low: str, high: str) -> str:
+    """One of OpenCV's colour scales between the values of its ends, as HTML."""
+    tones = np.linspace(0, 255, 9).astype(np.uint8)[None]
+    shown = cv2.applyColorMap(tones, colours)[0, :, ::-1].tolist()
+    steps = ",".join(f"rgb({r},{g},{b})" for r, g, b in shown)
+    style = f"display:inline-block;width:9em;height:.8em;background:linear-gradient(90deg,{steps})"
+    return f': {escape(low)} <span style="{style}"></span> {escape(high)}'
 
 
 def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:

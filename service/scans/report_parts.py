@@ -43,7 +43,8 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
     return f"<table>{head}{body}</table>"
 
 
-def figure(data: bytes, kind: str, caption: str) -> str:
+def figure(data: bytes, kind: str, caption: str, scale: str = "") -> str:
+    """An image and its caption; ``scale`` is HTML at the end of it."""
     code = base64.b64encode(data).decode("ascii")
     image = f'<img alt="" src="data:{kind};base64,{code}">'
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+    return f"<figure>{image}<figcaption>{escape(caption)}{scale}</figcaption></figure>"

@@ -125,7 +125,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     elif isinstance(scale, Mapping) and scale.get("from") == FIRST_TELEMETRY:
         unsized.append("too few keyframes in a row to measure the scale")
     elif sigma is not None and sigma > MAX_SCALE_SIGMA:
-        unsized.append(f"the scale is uncertain by {sigma:.0%}")
+        unsized.append(f"the scale is uncertain by {100.0 * sigma:.0f} % (1 sigma)")
     if doubts or unsized:
         return _said(Trust.DOUBTFUL if doubts else Trust.RELATIVE, doubts + unsized)
     if georeference == "none":
@@ -159,8 +159,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
 
 def _uncertain(sigma_focal: float) -> str:
     return (
-        f"the focal length is uncertain by {sigma_focal:.0%}: heights err by as much of the "
-        "distance; calibrate the camera"
+        f"the focal length is uncertain by {100.0 * sigma_focal:.0f} % (1 sigma): heights err by "
+        "as much of the distance; calibrate the camera"
     )
 
 
