@@ -23,8 +23,11 @@ class Similarity:
         return np.asarray(xyz @ (self.scale * self.R).T + self.t)
 
     def pose(self, T: F64) -> F64:
-        """(4, 4) pose of a camera moved along; its depths grow by the scale."""
-        return se3.compose(self.R @ T[:3, :3], self.points(T[:3, 3]))
+        """(..., 4, 4) poses of cameras moved along; their depths grow by the scale."""
+        out: F64 = T.copy()
+        out[..., :3, :3] = self.R @ T[..., :3, :3]
+        out[..., :3, 3] = self.points(T[..., :3, 3])
+        return out
 
 
 def lever(points: F64) -> F64:

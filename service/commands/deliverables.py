@@ -241,7 +241,11 @@ def site(
     The scans are not changed. A site's folder is a scan folder: export, mesh and refine --gcp
     work on it.
     """
+    from service.offline.exports.view import ExportOptions
+
     one_of(action, ACTIONS, "site")
+    with refusing("site"):
+        options = ExportOptions(cell_m=cell_m, tile_points=tile_points, scheduler=scheduler)
     if action == "align":
         from service.offline.site.alignment import align_site
         from service.offline.site.start import read_start
@@ -251,10 +255,7 @@ def site(
             raise InputError("--start is SCAN:POINTS.json")
         starts = {Path(scan): read_start(Path(points)) for scan, _, points in pairs}
         with showing("site") as progress:
-            made = align_site(
-                scans, out, starts=starts, progress=progress, tile_points=tile_points,
-                scheduler=scheduler,
-            )  # fmt: skip
+            made = align_site(scans, out, starts=starts, progress=progress, options=options)
         figures = made.document
         print(json.dumps(figures) if as_json else "\n".join(_aligned_lines(out, figures)))
         return
@@ -263,7 +264,7 @@ def site(
     if len(scans) != 2:
         raise InputError(f"site compare takes two scans, before and after, not {len(scans)}")
     with needing("a change map"), showing("site") as progress:
-        figures = compare(scans[0], scans[1], out, cell_m, tile_points, scheduler, bare, progress)
+        figures = compare(scans[0], scans[1], out, options, bare, progress)
     print(json.dumps(figures) if as_json else "\n".join(_change_lines(out, figures)))
 
 

@@ -50,7 +50,7 @@ from service.ground.state import KINDS, PortalState, folder_of, names_of, state_
 from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS
 from service.offline.exports.view import ExportOptions
-from service.offline.site.start import Pair, StartPoints
+from service.offline.site.start import Pair
 from service.scans.annotations import (
     Line,
     LineString,
@@ -338,8 +338,8 @@ def _align(request: Request, order: AlignOrder) -> Response:
     note(request, "align", to=f"{order.drone}/{order.scan}", points=len(order.points))
     state, folder = state_of(request), folder_of(request)
     other = state.library.folder(order.drone, order.scan)
-    start = StartPoints(order.points)
-    work = partial(align_by_points, state.library.store, state.limits, other, folder, start)
+    store = state.library.store
+    work = partial(align_by_points, store, state.limits, other, folder, order.points)
     return JSONResponse(state.jobs.start(folder, "align", work), 202)
 
 

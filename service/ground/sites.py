@@ -23,7 +23,7 @@ from service.ground.drone import DroneLimits
 from service.ground.scan_facts import Corner, Ground, Times, ground_in
 from service.ground.storage import DiskShare, is_regular, scan_files
 from service.offline.site import DRONE, SAME_VISIT_S, SITE
-from service.offline.site.start import StartPoints
+from service.offline.site.start import Pair
 from service.progress import Progress
 from service.small_file import read_json
 from service.workers import Worker, guarded, python_command, run_to_end
@@ -94,7 +94,7 @@ def align_by_points(
     limits: DroneLimits,
     other: Path,
     folder: Path,
-    start: StartPoints,
+    start: list[Pair],
     progress: Progress,
 ) -> str:
     """Align the scan in ``folder``, which points place, with the scan or site ``other``.

@@ -16,32 +16,21 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from recon.mapping.cloud_fusion import cloud_of
-from recon.mapping.voxel_map import ground_sample_m
 from recon.types import F64
 from service.errors import OutsideError, SkyreliefError
 from service.georeference import LocalFrame
 from service.packages import needing
 from service.progress import Progress
-from service.scans.fused_cloud import EVERYWHERE, Box
-from service.scans.main_piece import Keyframes, main_keyframes, main_seqs
+from service.scans.fused_cloud import EVERYWHERE, Box, Extent, extents_of
+from service.scans.main_piece import Keyframes, main_seqs
 from service.stream.store import ScanStore
 
 Job = TypeVar("Job")
 Made = TypeVar("Made")
 
 TILE_POINTS = 20_000_000
+MARGIN_VOXELS = 25
 POLL_S = 0.2
-
-
-@dataclass(frozen=True, slots=True)
-class KeyframeFootprint:
-    """Ground that one keyframe covers, and how finely."""
-
-    seq: int
-    points: int
-    sample_m: float
-    box: Box
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,100 +48,75 @@ class Tiling:
     """Tiles that cover the ground once; ``prints`` are empty where one tile is everything."""
 
     tiles: tuple[Tile, ...]
-    prints: tuple[KeyframeFootprint, ...] = ()
+    prints: tuple[Extent, ...] = ()
 
     @property
     def bounds(self) -> Box:
         """(west, south, east, north) of all footprints."""
-        return _bounds(self.prints)
+        return union(p.box for p in self.prints)
 
     @property
     def sample_m(self) -> float:
         """Median ground sample distance."""
-        return float(np.median([p.sample_m for p in self.prints]))
-
-
-def footprints(store: Keyframes) -> list[KeyframeFootprint]:
-    out = []
-    for k in main_keyframes(store):
-        sample = ground_sample_m(k.depth)
-        xyz = cloud_of(k.depth, k.bgr, k.fresh).xyz_m
-        if sample is not None and len(xyz):
-            (west, south), (east, north) = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
-            box = (float(west), float(south), float(east), float(north))
-            out.append(KeyframeFootprint(k.seq, len(xyz), sample, box))
-    return out
+        return float(np.median([p.ground_sample_m for p in self.prints]))
 
 
 def tiling(
     folder: Path, store: Keyframes, max_points: int, margin_m: float,
-    frame: LocalFrame | None = None,
+    frame: LocalFrame | None = None, voxel_m: float | None = None,
 ) -> Tiling:  # fmt: skip
-    """Tiles with about ``max_points`` stored points, and the points ``margin_m`` around each.
+    """Tiles with about ``max_points`` stored points, and the points ``margin_m`` around each, or
+    MARGIN_VOXELS of ``voxel_m`` where these are more; by default of the ground sample distance.
 
     Their boxes are in the scan's ENU metres, with ``frame`` in metres of its UTM zone. One tile is
     everything when the keyframes' pixels are no more than ``max_points``.
     """
-    seqs = main_seqs(store)
+    name, seqs = str(folder.resolve()), main_seqs(store)
     first = store.keyframe(seqs[0]) if seqs else None
-    if first is None or len(seqs) * first.fresh.size <= max_points:
-        return Tiling((Tile(str(folder.resolve()), EVERYWHERE, EVERYWHERE, tuple(seqs)),))
-    # By a reader of its own, which does not hold what it has decoded.
-    with ScanStore.open(folder / "scan.db", read_only=True) as fresh:
-        prints = footprints(fresh)
-    return Tiling(tuple(tiles_over(folder, prints, max_points, margin_m, frame)), tuple(
-        _on_map(prints, frame)
-    ))  # fmt: skip
-
-
-def tiles_over(
-    folder: Path, prints: Sequence[KeyframeFootprint], max_points: int, margin_m: float,
-    frame: LocalFrame | None = None,
-) -> list[Tile]:  # fmt: skip
-    """As :func:`tiling`, over these footprints."""
-    placed = _on_map(prints, frame)
-    bounds = grown(_bounds(placed), margin_m) if placed else EVERYWHERE
-    out = []
+    prints: list[Extent] = []
+    if first is not None and len(seqs) * first.fresh.size > max_points:
+        # By a reader of its own, which does not hold what it has decoded.
+        with ScanStore.open(folder / "scan.db", read_only=True) as fresh:
+            prints, _ = extents_of(fresh, Progress())
+    if not prints:
+        return Tiling((Tile(name, EVERYWHERE, EVERYWHERE, tuple(seqs)),))
+    placed = [
+        replace(p, box=box_around(p.box, None if frame is None else frame.to_utm)) for p in prints
+    ]
+    cut = Tiling((), tuple(placed))
+    margin_m = max(margin_m, MARGIN_VOXELS * (voxel_m or cut.sample_m))
+    bounds = grown(cut.bounds, margin_m)
+    tiles = []
     for box in tile_boxes(placed, max_points):
         wide = box
         if box != EVERYWHERE:
-            wide = grown(box, margin_m)
-            inner = np.clip(wide, np.tile(bounds[:2], 2), np.tile(bounds[2:], 2))
-            wide = _corners_box(inner, None if frame is None else frame.from_utm)
-        seqs = tuple(p.seq for p in prints if overlap(p.box, wide))
-        out.append(Tile(str(folder.resolve()), box, wide, seqs))
-    return out
+            inner = np.clip(grown(box, margin_m), np.tile(bounds[:2], 2), np.tile(bounds[2:], 2))
+            wide = box_around(inner, None if frame is None else frame.from_utm)
+        own = tuple(p.seq for p in prints if overlap(p.box, wide))
+        tiles.append(Tile(name, box, wide, own))
+    return replace(cut, tiles=tuple(tiles))
 
 
-def _on_map(
-    prints: Sequence[KeyframeFootprint], frame: LocalFrame | None
-) -> list[KeyframeFootprint]:
-    if frame is None:
-        return list(prints)
-    return [replace(p, box=_corners_box(np.array(p.box), frame.to_utm)) for p in prints]
-
-
-def _corners_box(box: F64, move: Callable[[F64], F64] | None) -> Box:
+def box_around(box: Sequence[float] | F64, move: Callable[[F64], F64] | None) -> Box:
+    """The box around the corners of a box that were moved."""
     west, south, east, north = (float(v) for v in box)
     if move is None:
         return west, south, east, north
-    corners = np.array([[x, y, 0.0] for x in (west, east) for y in (south, north)])
-    (west, south), (east, north) = (f(move(corners)[:, :2], axis=0) for f in (np.min, np.max))
-    return float(west), float(south), float(east), float(north)
+    corners = move(np.array([[x, y, 0.0] for x in (west, east) for y in (south, north)]))
+    return *corners[:, :2].min(axis=0).tolist(), *corners[:, :2].max(axis=0).tolist()
 
 
-def _bounds(prints: Sequence[KeyframeFootprint]) -> Box:
-    boxes = np.array([p.box for p in prints])
-    west, south = boxes[:, :2].min(axis=0)
-    east, north = boxes[:, 2:].max(axis=0)
-    return float(west), float(south), float(east), float(north)
+def union(boxes: Iterable[Box]) -> Box:
+    """The box around some boxes, at least one."""
+    west, south, east, north = zip(*boxes, strict=True)
+    return min(west), min(south), max(east), max(north)
 
 
 def grown(box: Box, by_m: float) -> Box:
     return box[0] - by_m, box[1] - by_m, box[2] + by_m, box[3] + by_m
 
 
-def tile_boxes(prints: Sequence[KeyframeFootprint], max_points: int) -> list[Box]:
+def tile_boxes(prints: Sequence[Extent], max_points: int) -> list[Box]:
     """Boxes that cover the site, each with about ``max_points`` stored points at most.
 
     One box without borders when all points are fewer. Empty boxes are left out. Points are
@@ -160,7 +124,7 @@ def tile_boxes(prints: Sequence[KeyframeFootprint], max_points: int) -> list[Box
     """
     if sum(p.points for p in prints) <= max_points:
         return [EVERYWHERE]
-    bounds = _bounds(prints)
+    bounds = union(p.box for p in prints)
     low, high = np.array(bounds[:2]), np.array(bounds[2:])
     side = float((high - low).max())
     for _ in range(12):
@@ -183,7 +147,7 @@ def _grid(low: F64, high: F64, side: float) -> Iterator[Box]:
             yield float(west), float(south), float(east), float(north)
 
 
-def _points_in(prints: Sequence[KeyframeFootprint], tile: Box) -> float:
+def _points_in(prints: Sequence[Extent], tile: Box) -> float:
     total = 0.0
     for p in prints:
         shares = [

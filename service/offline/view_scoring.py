@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -234,8 +235,7 @@ def _outline(scan: ScanView) -> Callable[[Camera, F64], Bool]:
 
     def inside(camera: Camera, T: F64) -> Bool:
         w, h = camera.size_px
-        u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
-        ways = rays(camera.K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T
+        ways = _pixel_rays(camera.K, w, h) @ T[:3, :3].T
         middle = T[:3, 3] if frame is None else frame.to_utm(T[None, :3, 3])[0]
         drop = np.where(ways[:, 2] < -0.05, (height - middle[2]) / np.minimum(ways[:, 2], -0.05), 0)
         ground = T[:3, 3] + ways * drop[:, None]
@@ -249,15 +249,20 @@ def _outline(scan: ScanView) -> Callable[[Camera, F64], Bool]:
     return inside
 
 
+def _pixel_rays(K: F64, w: int, h: int) -> F64:
+    """(h * w, 3) rays of all pixels, row by row."""
+    v, u = np.mgrid[:h, :w].astype(np.float64)
+    return rays(K, np.column_stack([u.ravel(), v.ravel()]))
+
+
 def depth_grids(keyframes: Sequence[Keyframe]) -> Triangles:
     """Each keyframe's depth image as two triangles per four pixels of one surface."""
     vertices, faces, colours, first = [], [], [], 0
     for k in keyframes:
         z, (h, w) = k.depth.depth_m, k.depth.depth_m.shape
-        u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
-        ways = rays(k.depth.K, np.column_stack([u.ravel(), v.ravel()]))
         known = np.nan_to_num(z.ravel()[:, None])
-        vertices.append(se3.transform(k.depth.T_world_camera, ways * known))
+        places = _pixel_rays(k.depth.K, w, h) * known
+        vertices.append(se3.transform(k.depth.T_world_camera, places))
         colours.append(k.bgr.reshape(-1, 3).astype(np.float32))
         four = np.stack([z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]])
         good = np.isfinite(four).all(axis=0) & (np.ptp(four, axis=0) < MAX_SLOPE * four.min(axis=0))
@@ -342,12 +347,6 @@ def draw_points(camera: Camera, T: F64, xyz_m: F64, bgr: F32) -> tuple[U8, Bool]
     inside = (u >= reach) & (u < w - reach) & (v >= reach) & (v < h - reach)
     u, v, colour = u[inside].astype(int), v[inside].astype(int), bgr[ahead[inside]]
     out, covered = np.zeros((h, w, 3), np.uint8), np.zeros((h, w), np.bool_)
-    for dv, du in _around(reach):
+    for dv, du in product(range(-reach, reach + 1), repeat=2):
         out[v + dv, u + du], covered[v + dv, u + du] = colour, True
     return out, covered
-
-
-def _around(reach: int) -> Iterator[tuple[int, int]]:
-    for dv in range(-reach, reach + 1):
-        for du in range(-reach, reach + 1):
-            yield dv, du

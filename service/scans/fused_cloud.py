@@ -63,11 +63,12 @@ class FusedCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extent:
+    """Ground that one keyframe covers, and how finely."""
+
     seq: int
     points: int
     ground_sample_m: float
-    west_m: float
-    east_m: float
+    box: Box
 
 
 def fused_cloud(
@@ -87,7 +88,7 @@ def fused_cloud(
     """
     progress = progress or Progress()
     with progress.part("reading the keyframes", 0.2):
-        extents, held = _extents(store, progress, box, strip_points)
+        extents, held = extents_of(store, progress, box, strip_points)
     points = sum(e.points for e in extents)
     sample = float(np.median([e.ground_sample_m for e in extents])) if extents else None
     size = max(voxel_m or sample or DEFAULT_VOXEL_M, SMALLEST_VOXEL_M)
@@ -110,8 +111,8 @@ def fused_cloud(
     return FusedCloud(cloud, size, sample, len(extents), points, notes)
 
 
-def _extents(
-    store: Keyframes, progress: Progress, box: Box, room: int
+def extents_of(
+    store: Keyframes, progress: Progress, box: Box = EVERYWHERE, room: int = 0
 ) -> tuple[list[Extent], dict[int, PointCloud]]:
     """The keyframes of the main piece with points, and the clouds of the first ``room`` points."""
     out: list[Extent] = []
@@ -120,8 +121,9 @@ def _extents(
         sample = ground_sample_m(keyframe.depth)
         cloud = _points(keyframe, box)
         if sample is not None and len(cloud):
-            x = cloud.xyz_m[:, 0]
-            out.append(Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
+            (west, south), (east, north) = (f(cloud.xyz_m[:, :2], axis=0) for f in (np.min, np.max))
+            around = float(west), float(south), float(east), float(north)
+            out.append(Extent(keyframe.seq, len(cloud), sample, around))
             room -= len(cloud)
             if room >= 0:
                 held[keyframe.seq] = cloud
@@ -148,8 +150,9 @@ def strip_edges(extents: Iterable[Extent], max_points: int) -> list[float]:
 
     A keyframe's points are assumed to be evenly spread over its width.
     """
-    ends = [(e.west_m, e.points / max(e.east_m - e.west_m, 1e-3)) for e in extents]
-    ends += [(e.east_m, -e.points / max(e.east_m - e.west_m, 1e-3)) for e in extents]
+    widths = [(e.box[0], e.box[2], e.points) for e in extents]
+    ends = [(west, points / max(east - west, 1e-3)) for west, east, points in widths]
+    ends += [(east, -points / max(east - west, 1e-3)) for west, east, points in widths]
     if not ends:
         return [-np.inf, np.inf]
     table: F64 = np.array(sorted(ends))
@@ -171,7 +174,7 @@ def _strip(
 ) -> Callable[[], Iterator[PointCloud]]:
     """The clouds of the keyframes that overlap a strip, ``held`` or read on demand."""
     margin = 1.0  # edges are moved by up to a voxel
-    seqs = [e.seq for e in extents if e.east_m >= low_m - margin and e.west_m <= high_m + margin]
+    seqs = [e.seq for e in extents if e.box[2] >= low_m - margin and e.box[0] <= high_m + margin]
 
     def clouds() -> Iterator[PointCloud]:
         for seq in seqs:

@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
@@ -305,9 +306,10 @@ def targets(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     """Distances between surveyed targets, scaled by their median, and their horizontal rms."""
     with ScanStore.open(flight.scan / "scan.db") as store:
         revisions = Revisions(store)
-        states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
+        states = revisions.states()
         start = store.header.started_unix_ns
-        scan = ScanImages(states, revisions.frames(), store.header, revisions.keyframe, None)
+        keyframe = partial(revisions.keyframe, states)
+        scan = ScanImages(states, revisions.frames(), store.header, keyframe, None)
         times = {image.name: image.time_ns for image in open_camera(flight.source)}
         placed = {_tick(frame.time_unix_ns - start) for frame in scan.frames}
         surveyed = _surveyed(flight.data / "gcp_list_1600px.txt", times, placed, start)

@@ -224,16 +224,16 @@ def _make(kind: str, site: Path, parts: Any, scheduler: str | None, progress: Pr
     from service.offline.site.alignment import write_files
     from service.offline.site.compare import changes
 
+    options = ExportOptions(stored=True, tile_points=TILE_POINTS, scheduler=scheduler)
     if kind == FILES:
-        write_files(site, TILE_POINTS, scheduler, progress)
+        write_files(site, options, progress)
         return
     with ScanView(site, None, progress) as view:
         if kind == "change":
-            found = changes(view, site, parts, PLACING_M, None, TILE_POINTS, scheduler, progress)
+            found = changes(view, site, parts, PLACING_M, options)
             count = 0 if found is None else len(found.objects)
             (site / FOUND).write_text(json.dumps(count), encoding="utf-8")
         else:
-            options = ExportOptions(stored=True, tile_points=TILE_POINTS, scheduler=scheduler)
             export(view, kind, None, options)
 
 
@@ -257,7 +257,7 @@ def _height_error(path: Path, dates: list[Simulation], scans: int) -> BenchResul
             row, col = np.nonzero(height != image.nodata)
             if not len(row):
                 continue
-            x, y = image.transform * (col + window.col_off + 0.5, row + window.row_off + 0.5)
+            x, y = image.xy(row + window.row_off, col + window.col_off)
             enu = ORIGIN.from_utm(np.column_stack([x, y, height[row, col]]))
             inside = np.mod(enu[:, :2] + 0.5 * SPACING_M, SPACING_M) - 0.5 * SPACING_M
             here = (np.abs(inside) < 0.5 * SPACING_M - 2.0).all(axis=1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,9 +73,14 @@ def write_ply(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 def _ply_head(crs: str, count: int) -> bytes:
     """The header for ``count`` points, of one length for any: the comment is padded."""
-    head = ["ply", "format binary_little_endian 1.0", "comment " + crs.ljust(100 - len(str(count)))]
-    head += [f"element vertex {count}"]
-    head += [f"property {kind} {name}" for name, _, kind in PLY_TYPES]
+    fields = [(kind, name) for name, _, kind in PLY_TYPES]
+    return ply_head(crs.ljust(100 - len(str(count))), count, fields)
+
+
+def ply_head(comment: str, count: int, fields: Iterable[tuple[str, str]]) -> bytes:
+    """The header of a binary PLY of ``count`` vertices; ``fields`` are types and names."""
+    head = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
+    head += [f"element vertex {count}", *(f"property {kind} {name}" for kind, name in fields)]
     return "\n".join([*head, "end_header", ""]).encode("ascii")
 
 
@@ -96,7 +101,7 @@ def points_of(
     Raises InputError, at the first, when there is not a single point.
     """
     make, margin_m = (_classified, GROUND_MARGIN_M) if is_classified else (_placed, VOXELS_MARGIN_M)
-    return in_parts(scan, make, options, margin_m, needs_cell=False)
+    return in_parts(scan, make, options, margin_m)
 
 
 def _placed(

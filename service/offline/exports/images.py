@@ -124,15 +124,17 @@ def shared_images(scan: ScanView, options: ExportOptions) -> list[TextureView]:
     return scan.shared(("images", images_key(options)), read)
 
 
+def source_of(scan: ScanView, options: ExportOptions) -> Path | None:
+    """The recording that images are taken from; None where it is the scan's own store."""
+    if options.video is not None or options.stored:
+        return options.video
+    return recording_of(scan.folder, scan.store.header).path
+
+
 def images_key(options: ExportOptions) -> tuple[Path | None, bool, int | None]:
     """What of the options decides which images are read."""
     video = None if options.video is None else options.video.resolve()
     return video, options.stored, options.video_epoch_ns
-
-
-def check_video(header: ScanHeader, video: Path) -> None:
-    """Raise InputError or OutsideError when ``video`` cannot be that of the scan."""
-    opened(header, video).close()
 
 
 def opened(
@@ -168,27 +170,36 @@ def frames_at(
     """
     source = opened(header, video, opener)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
-    times = np.array(times_ns, np.int64)
-    found = set[int]()
-
-    if isinstance(source, VideoSource | ImagesSource):
-        source.only_near((times - start).tolist(), SAME_TIME_NS)
-    say = (progress or Progress()).counting(len(times))
-    with closing(source):
-        for frame in source:
-            time_ns = start + frame.time_ns
-            nearest = int(np.abs(times - time_ns).argmin())
-            if abs(int(times[nearest]) - time_ns) <= SAME_TIME_NS:
-                found.add(nearest)
-                yield nearest, frame.image
-                say("reading the images")
-            if len(found) == len(times) or time_ns > times.max() + SAME_TIME_NS:
-                break
-    if not found:
+    say = (progress or Progress()).counting(len(times_ns))
+    is_any = False
+    for nearest, image in frames_near(source, [t - start for t in times_ns], SAME_TIME_NS):
+        is_any = True
+        yield nearest, image
+        say("reading the images")
+    if not is_any:
         raise InputError(
             f"{video}: no frame was taken at the time of a keyframe; give the --video-epoch "
             "that the scan was made with"
         )
+
+
+def frames_near(
+    source: CameraSource, times_ns: Sequence[int], within_ns: int
+) -> Iterator[tuple[int, U8]]:
+    """Place of each time in ``times_ns``, by the source's own clock, and the frames taken within
+    ``within_ns`` of it, until each has one. The source is closed."""
+    times = np.array(times_ns, np.int64)
+    found = set[int]()
+    if isinstance(source, VideoSource | ImagesSource):
+        source.only_near(times.tolist(), within_ns)
+    with closing(source):
+        for frame in source:
+            nearest = int(np.abs(times - frame.time_ns).argmin())
+            if abs(int(times[nearest]) - frame.time_ns) <= within_ns:
+                found.add(nearest)
+                yield nearest, frame.image
+            if len(found) == len(times) or frame.time_ns > times.max() + within_ns:
+                break
 
 
 def video_images(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import logging
 import math
@@ -18,20 +17,20 @@ import cv2
 import numpy as np
 
 from recon.parallel import run_parallel
-from recon.types import F32, F64, Array
+from recon.types import Array
 from service.errors import InputError
-from service.georeference import between_nodes, unwrapped
 from service.offline.exports import EXPORTERS
 from service.offline.exports.flight import iso_time
-from service.offline.exports.rasters import open_map, write_ortho, written_ortho
+from service.offline.exports.rasters import open_map, warped, write_ortho, written_ortho
 from service.offline.exports.view import ExportOptions, ScanView, check, export
+from service.offline.tiles import union
 from service.scans.folder import Failures
+from service.scans.fused_cloud import Box
 from service.scans.track import flown_datum
 from service.scans.writing import filling_folder, write_whole, writing
 from service.version import software
 
 MAX_OVERLAY_PX = 4096
-JPEG_QUALITY = 85
 
 
 def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -45,7 +44,7 @@ def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
         if path is None:
             path = Path(folder) / "ortho.tif"
             write_ortho(scan, path, options)
-        image, (west, south, east, north) = _in_degrees(path)
+        image, (west, south, east, north) = _overlay(path)
     _, data = cv2.imencode(".png", image)
     name = escape(scan.store.header.scan_id)
     kml = (
@@ -59,68 +58,29 @@ def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
         file.writestr("ortho.png", data.tobytes())
 
 
-def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
-    """(h, w, 4) BGRA of a raster in longitude and latitude, and its bounds in degrees."""
-    from pyproj import Transformer
+def _overlay(path: Path) -> tuple[Array, Box]:
+    """(h, w, 4) BGRA of a raster in longitude and latitude, and its bounds in degrees; across 180
+    degrees the eastern one is beyond it."""
+    from rasterio.transform import from_bounds
 
     with open_map(path, 4) as image:
-        west, south, east, north = _box_in_degrees(image)
+        west, south, east, north = _in_degrees(image.crs, image.bounds)
+        east += 360.0 if east < west else 0.0
         # Square in degrees, and as many along the diagonal as the raster has.
         pixel = math.hypot(east - west, north - south) / math.hypot(image.width, image.height)
         pixel = max(pixel, max(east - west, north - south) / MAX_OVERLAY_PX)
         w, h = max(1, round((east - west) / pixel)), max(1, round((north - south) / pixel))
-        to_map = Transformer.from_crs("EPSG:4326", image.crs, always_xy=True)
-        lon = west + (east - west) * (np.arange(w) + 0.5) / w
-        lat = north - (north - south) * (np.arange(h) + 0.5) / h
-        rgba = resampled(image, 4, lon, lat, lambda at: np.array(to_map.transform(*at.T)).T)
+        transform = from_bounds(west, south, east, north, w, h)
+        rgba = warped(image, transform, "EPSG:4326", (h, w)).transpose(1, 2, 0)
     return np.ascontiguousarray(rgba[..., [2, 1, 0, 3]]), (west, south, east, north)
 
 
-def resampled(
-    image: Any,
-    bands: int,
-    x: F64,
-    y: F64,
-    to_map: Callable[[F64], F64],
-    unknown: float | None = None,
-) -> Array:
-    """(len(y), len(x), bands) of an open raster, reduced to MAX_OVERLAY_PX where it is larger.
-
-    ``to_map`` takes (N, 2) columns x and y to the raster's own coordinates. Outside stands 0; with
-    a value for ``unknown`` cells that, and nothing is interpolated.
-    """
-    from rasterio.enums import Resampling
-
-    shrink = max(1.0, max(image.width, image.height) / MAX_OVERLAY_PX)
-    size = round(image.height / shrink), round(image.width / shrink)
-    how = Resampling.average if unknown is None else Resampling.nearest
-    data = image.read(list(range(1, bands + 1)), out_shape=(bands, *size), resampling=how)
-    scale = image.transform.scale(image.width / size[1], image.height / size[0])
-    from_map = ~(image.transform * scale)
-
-    def pixels(at: F64) -> F32:
-        cols, rows = from_map * to_map(at).T
-        return np.column_stack([cols - 0.5, rows - 0.5]).astype(np.float32)
-
-    u, v = between_nodes(x, y, pixels)
-    flat = np.ascontiguousarray(data.transpose(1, 2, 0))
-    between = cv2.INTER_LINEAR if unknown is None else cv2.INTER_NEAREST
-    found = cv2.remap(flat, u, v, between, borderValue=[unknown or 0.0] * 4)
-    return np.asarray(found).reshape(len(y), len(x), bands)
-
-
-def _box_in_degrees(image: Any) -> tuple[float, float, float, float]:
-    """West, south, east and north of a map; across 180 degrees one longitude lies beyond it."""
+def _in_degrees(crs: Any, box: Box) -> Box:
+    """West, south, east and north of a box on a map; across 180 degrees west is above east."""
     from pyproj import Transformer
 
-    west, south, east, north = image.bounds
-    side = np.linspace(0.0, 1.0, 33)[:, None]
-    corners = np.array([[west, north], [east, north], [east, south], [west, south], [west, north]])
-    border = np.concatenate([a + side * (b - a) for a, b in itertools.pairwise(corners)])
-    to_degrees = Transformer.from_crs(image.crs, "EPSG:4326", always_xy=True)
-    lon, lat = to_degrees.transform(*border.T)
-    lon = unwrapped(lon)
-    return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
+    found: Box = Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform_bounds(*box)
+    return found
 
 
 RASTERS = {"ortho.tif": "visual", "dsm.tif": "data", "dtm.tif": "data", "coverage.tif": "data"}
@@ -134,9 +94,14 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
              if (folder / name).is_file()}  # fmt: skip
     if not found:
         raise InputError(f"{folder} contains no raster; export dsm or ortho first")
-    corners = np.concatenate([a.pop("corners") for a in found.values()])
-    geodetic = frame.to_geodetic(frame.from_utm(corners))
-    bbox, geometry = _extent(geodetic[:, 0], geodetic[:, 1])
+    box = union(asset.pop("bounds") for asset in found.values())
+    west, south, east, north = bbox = _in_degrees(f"EPSG:{frame.epsg}", box)
+    # Across 180 degrees west is above east and the polygon is cut (RFC 7946, 3.1.9 and 5.2).
+    sides = [(west, east)] if west <= east else [(west, 180.0), (-180.0, east)]
+    rings = [[[[w, south], [e, south], [e, north], [w, north], [w, south]]] for w, e in sides]
+    geometry: dict[str, Any] = {"type": "MultiPolygon", "coordinates": rings}
+    if len(rings) == 1:
+        geometry = {"type": "Polygon", "coordinates": rings[0]}
     times = [p.time_unix_ns for p in scan.poses] or [scan.store.header.started_unix_ns]
     start, end = iso_time(min(times)), iso_time(max(times))
     item = {
@@ -159,31 +124,15 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
     write_whole(out, json.dumps(item, indent=1))
 
 
-def _extent(lat_deg: F64, lon_deg: F64) -> tuple[list[float], dict[str, Any]]:
-    """Box and GeoJSON polygon of places; across 180 degrees west is above east and the polygon is
-    cut (RFC 7946, 3.1.9 and 5.2)."""
-    lon = unwrapped(lon_deg)
-    low, high, south, north = (float(f(v)) for v in (lon, lat_deg) for f in (np.min, np.max))
-    west, east = ((v + 180.0) % 360.0 - 180.0 for v in (low, high))
-    sides = [(west, east)] if west <= east else [(west, 180.0), (-180.0, east)]
-    rings = [[[[w, south], [e, south], [e, north], [w, north], [w, south]]] for w, e in sides]
-    if len(rings) == 1:
-        return [west, south, east, north], {"type": "Polygon", "coordinates": rings[0]}
-    return [west, south, east, north], {"type": "MultiPolygon", "coordinates": rings}
-
-
 def _asset(path: Path, role: str) -> dict[str, Any]:
     with open_map(path) as image:
-        west, south, east, north = image.bounds
         return {
             "href": f"./{path.name}",
             "type": "image/tiff; application=geotiff; profile=cloud-optimized",
             "roles": [role],
             "proj:shape": list(image.shape),
             "proj:transform": list(image.transform)[:6],
-            "corners": np.array(
-                [[west, south, 0.0], [west, north, 0.0], [east, south, 0.0], [east, north, 0.0]]
-            ),
+            "bounds": tuple(image.bounds),
         }
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -18,13 +19,12 @@ from recon.surface.texture_views import TextureView, doubled_area, ray_scene
 from recon.surface.texturing import texture
 from recon.surface.volume import volume_mesh
 from recon.types import F64, U8
-from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import check_video, images_key, recording_of, shared_images
-from service.offline.exports.view import ExportOptions, ScanView
-from service.offline.tiles import Tile, footprints, run_tiles, tiles_over
+from service.offline.exports.images import images_key, opened, shared_images, source_of
+from service.offline.exports.view import ExportOptions, ScanView, in_parts
 from service.packages import needing
 from service.progress import Progress
+from service.scans.fused_cloud import Box
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing, writing_folder
 
@@ -33,8 +33,8 @@ log = logging.getLogger(__name__)
 LARGEST_ATLAS_PX = 8192
 MIN_FACES, MIN_TEXTURE_PX = 500, 256
 TILED_ATLAS_PX = 4096
-MARGIN_VOXELS, MARGIN_M = 25, 5.0
-"""About a tile's mesh, the larger of the two; it is then cut exactly at the tile's borders."""
+MARGIN_M = 5.0
+"""About a tile's mesh, which is then cut exactly at the tile's borders."""
 
 TEXTURE_STEPS = 15
 """Reports of :func:`recon.surface.texturing.texture`."""
@@ -92,33 +92,17 @@ def _mesh_parts(
         import open3d  # noqa: F401
         import trimesh  # noqa: F401
     if options.video is not None:
-        check_video(scan.store.header, options.video)
-    prints = footprints(scan.store)
-    if not prints:
-        raise InputError(f"{scan.folder} contains no points yet; nothing to mesh")
-    voxel_m = options.voxel_m or float(np.median([p.sample_m for p in prints]))
-    video = options.video
-    if video is None and not options.stored:
-        video = recording_of(scan.folder, scan.store.header).path
-    margin_m = max(MARGIN_VOXELS * voxel_m, MARGIN_M)
-    tiles = tiles_over(scan.folder, prints, options.tile_points, margin_m)
-    jobs = [
-        TileJob(
-            tile,
-            voxel_m,
-            max(1000, largest_faces // len(tiles)),
-            LARGEST_ATLAS_PX if len(tiles) == 1 else TILED_ATLAS_PX,
-            levels,
-            options if options.video is None else replace(options, video=options.video.resolve()),
-        )
-        for tile in tiles
-    ]
-    is_here = len(jobs) == 1 and options.scheduler is None  # shares what this view has made
-    make = (lambda job, _: _part(scan, job)) if is_here else mesh_tile
-    made = run_tiles(make, jobs, options.scheduler, scan.progress)
-    parts = [part for part in made if part is not None]
-    if not parts:
-        raise InputError(f"{scan.folder}: cannot be meshed, there is too little surface")
+        opened(scan.store.header, options.video).close()  # refused before the work
+    count = len(scan.tiling(options, MARGIN_M, on_map=False).tiles)
+    make = partial(
+        mesh_part,
+        largest_faces=max(1000, largest_faces // count),
+        largest_px=LARGEST_ATLAS_PX if count == 1 else TILED_ATLAS_PX,
+        levels=levels,
+    )
+    nothing = "cannot be meshed, there is too little surface"
+    parts = list(in_parts(scan, make, options, MARGIN_M, on_map=False, nothing=nothing))
+    video = source_of(scan, options)
     figures = {
         "tiles": len(parts),
         "faces": sum(p.figures["faces"] for p in parts),
@@ -137,18 +121,6 @@ def _share(name: str, parts: Sequence[TilePart]) -> float:
     return float(np.average([p.figures[name] for p in parts], weights=weights))
 
 
-@dataclass(frozen=True, slots=True)
-class TileJob:
-    """One tile's mesh, in plain values; its box is in the scan's ENU metres."""
-
-    tile: Tile
-    voxel_m: float
-    largest_faces: int
-    largest_texture_px: int
-    levels: int = 1
-    options: ExportOptions = field(default_factory=ExportOptions)  # where images come from
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class TilePart:
     """A tile's mesh and texture, and what it was made of."""
@@ -160,33 +132,33 @@ class TilePart:
     error_m: float = 0.0  # of the surface in less detail
 
 
-def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None:
-    """The textured mesh of a tile; None when there is too little surface in it."""
-    with ScanView(Path(job.tile.folder), job.voxel_m, progress, job.tile) as scan:
-        return _part(scan, job)
-
-
-def _part(scan: ScanView, job: TileJob) -> TilePart | None:
-    progress, box = scan.progress, job.tile.box
-    if not scan.has_points:
-        return None
+def mesh_part(
+    scan: ScanView,
+    options: ExportOptions,
+    box: Box,
+    largest_faces: int,
+    largest_px: int,
+    levels: int = 1,
+) -> TilePart | None:
+    """The textured mesh in a box of ENU metres; None when there is too little surface in it."""
+    progress = scan.progress
     try:
-        mesh = cut(closed_surface(scan, job.largest_faces), box)
+        mesh = cut(closed_surface(scan, largest_faces), box)
     except ValueError as error:
         log.debug("tile %s: %s", box, error)
         return None
     if not len(mesh.faces):
         return None
     with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
-        views = shared_images(scan, job.options)
+        views = shared_images(scan, options)
 
     def made() -> TilePart:
         with progress.part("texture", 0.8):
-            return _textured(mesh, views, job.largest_texture_px, progress)
+            return _textured(mesh, views, largest_px, progress)
 
-    part = scan.shared(("textured mesh", job.largest_faces, images_key(job.options)), made)
+    part = scan.shared(("textured mesh", largest_faces, images_key(options)), made)
     coarse = []
-    for n in range(1, job.levels):
+    for n in range(1, levels):
         with progress.part("less detail"):
             few = coarser(mesh, max(MIN_FACES, len(mesh.faces) // COARSER_FACES**n))
             px = max(MIN_TEXTURE_PX, max(part.image.shape) // COARSER_TEXTURE**n)
@@ -274,15 +246,19 @@ def glb(parts: Sequence[tuple[Mesh, U8 | None]], extras: dict[str, Any]) -> byte
         scene.add_geometry(_geometry(mesh, textures[-1] is not None), f"surface {number}")
 
     def add_textures(buffers: Any, tree: dict[str, Any]) -> None:
-        tree["materials"] = [_material() for _ in textures]
+        tree["materials"] = []
         for number, image in enumerate(textures):
             tree["meshes"][number]["primitives"][0]["material"] = number
+            surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
             if image is not None:
                 tree["images"].append({"bufferView": len(buffers), "mimeType": "image/jpeg"})
                 buffers[f"image {number}"] = _jpeg(image)
-                base = {"index": len(tree["textures"])}
+                surface["baseColorTexture"] = {"index": len(tree["textures"])}
                 tree["textures"].append({"source": len(tree["images"]) - 1, "sampler": 0})
-                tree["materials"][number]["pbrMetallicRoughness"]["baseColorTexture"] = base
+            # Unlit and double-sided: the image's colours are shown from both sides.
+            unlit: dict[str, Any] = {"KHR_materials_unlit": {}}
+            material = {"pbrMetallicRoughness": surface, "extensions": unlit, "doubleSided": True}
+            tree["materials"].append(material)
         if tree["textures"]:
             wrap = {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
             tree["samplers"] = [wrap | {"minFilter": TRILINEAR}]
@@ -321,15 +297,6 @@ def _geometry(mesh: Mesh, textured: bool) -> Any:
         opaque = np.full(len(mesh.rgb), 255, np.uint8)
         made.visual.vertex_colors = np.column_stack([_linear(mesh.rgb), opaque])
     return made
-
-
-def _material() -> dict[str, Any]:
-    """Unlit and double-sided: the image's colours are shown from both sides."""
-    return {
-        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-        "extensions": {"KHR_materials_unlit": {}},
-        "doubleSided": True,
-    }
 
 
 def _linear(rgb: U8) -> U8:

@@ -22,10 +22,17 @@ from recon.surface.texture_views import TextureView
 from recon.types import Array
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import recording_of, shared_images
+from service.offline.exports.images import shared_images, source_of
 from service.offline.exports.surface import bare_ground, cell_places, complete_model, surface_model
-from service.offline.exports.view import ExportOptions, Make, ScanView, in_parts
-from service.offline.tiles import grown
+from service.offline.exports.view import (
+    NO_POINTS,
+    ExportOptions,
+    Make,
+    NoPointsError,
+    ScanView,
+    in_parts,
+)
+from service.offline.tiles import box_around, grown
 from service.scans.coverage import coverage_of
 from service.scans.fused_cloud import Box
 from service.scans.main_piece import main_keyframes, main_seqs
@@ -38,6 +45,9 @@ QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
 
 RAW = {"tiled": True, "sparse_ok": True, "bigtiff": "IF_SAFER"}
 GDAL_CACHE_BYTES = 128_000_000
+
+SOME_MAP, EARTH_RADIUS_M = "EPSG:32631", 6.371e6
+"""The first stands for the map of a scan without georeference, whose metres stay as they are."""
 
 OBJECT_M = 1.0
 """Above the bare ground; seams of the orthophoto run around what is higher."""
@@ -98,7 +108,7 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     """
     keyframes = list(main_keyframes(scan.store))
     if not any(np.isfinite(k.depth.depth_m).any() for k in keyframes):
-        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+        raise NoPointsError(f"{scan.folder} {NO_POINTS}")
     with scan.progress.part("reading the images", 0.6):
         here, there = scan.progress.branches(2)
         surface: list[Raster] = []
@@ -146,11 +156,12 @@ def _write(
     """One kind of raster, in tiles where there are more points than one may have."""
     cut, whole = scan.tiling(options, margin_m), None
     if len(cut.tiles) > 1:
-        options = scan.for_tiles(options, cut, needs_cell=make is not ortho)
-        cell_m = options.cell_m or round_cell(cut.sample_m / _finer(scan, options))
-        edge = 2.0 * max(cell_m, options.voxel_m or 0.0)
-        whole = over(grown(cut.bounds, edge), cell_m)
-        options = replace(options, cell_m=cell_m)
+        fixed = scan.for_tiles(options, cut)
+        if make is ortho and options.cell_m is None:
+            fixed = replace(fixed, cell_m=round_cell(cut.sample_m / _finer(scan, options)))
+        assert fixed.cell_m is not None and fixed.voxel_m is not None
+        edge = 2.0 * max(fixed.cell_m, fixed.voxel_m)
+        whole, options = over(grown(cut.bounds, edge), fixed.cell_m), fixed
     parts = in_parts(scan, make, options, margin_m)
     first = next(parts)
     with mosaic(scan, out, whole or first.grid, first) as image:
@@ -161,9 +172,7 @@ def _write(
 def _finer(scan: ScanView, options: ExportOptions) -> float:
     """By how much pixels of the recording are finer than those of the store; 1 without one."""
     seqs, camera = main_seqs(scan.store), scan.store.header.camera
-    if options.video is None and (
-        options.stored or recording_of(scan.folder, scan.store.header).path is None
-    ):
+    if source_of(scan, options) is None:
         return 1.0
     first = scan.store.keyframe(seqs[0])
     assert first is not None  # there is more than one tile
@@ -202,7 +211,6 @@ def mosaic(scan: ScanView, out: Path, grid: Grid, like: Layers) -> Iterator[Any]
     import rasterio
     from rasterio.enums import ColorInterp
     from rasterio.shutil import copy
-    from rasterio.transform import from_origin
 
     profile: dict[str, Any] = {
         "driver": "GTiff",
@@ -210,7 +218,7 @@ def mosaic(scan: ScanView, out: Path, grid: Grid, like: Layers) -> Iterator[Any]
         "width": grid.shape[1],
         "count": len(like.bands),
         "dtype": like.bands.dtype,
-        "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
+        "transform": transform_of(grid),
         "nodata": like.nodata,
     }
     if scan.frame is not None:
@@ -253,16 +261,25 @@ def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
     Raises InputError when the scan contains no surface.
     """
+    from rasterio.warp import Resampling, reproject
+
     found = coverage_of(scan.store, options.cell_m)
     if found is None:
-        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+        raise InputError(f"{scan.folder} {NO_POINTS}")
     layer, grid = found.layer, found.layer.grid
     origin = np.zeros((1, 3)) if scan.frame is None else scan.frame.to_geodetic(np.zeros((1, 3)))
     height = layer.height_m + origin[0, 2]
     bands = np.stack([layer.views.astype(np.float32), layer.sigma_m, height]).astype(np.float32)
     bands[:, ~(layer.known | (layer.views > 0))] = np.nan
     if scan.frame is not None:
-        grid, bands = _in_utm(bands, grid, scan.frame)
+        grid = over(box_around(layer.grid.bounds, scan.frame.to_utm), layer.grid.cell_m)
+        transform, crs = enu_map(layer.grid, scan.frame)
+        bands, _ = reproject(
+            bands, np.full((len(bands), *grid.shape), np.nan, np.float32),
+            src_transform=transform, src_crs=crs, src_nodata=np.nan,
+            dst_transform=transform_of(grid), dst_crs=f"EPSG:{scan.frame.epsg}",
+            resampling=Resampling.nearest,
+        )  # fmt: skip
     bands = np.where(np.isfinite(bands), bands, np.float32(NODATA_M))
     names = ("views", "sigma, m", "height, m")
     layers = Layers(grid, bands, names, NODATA_M, options.to_datum)
@@ -270,29 +287,38 @@ def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
         put(image, layers)
 
 
-def _in_utm(bands: Array, grid: Grid, frame: LocalFrame) -> tuple[Grid, Array]:
-    """The bands on a north-up grid of the frame's UTM zone, nearest cell taken.
+def transform_of(grid: Grid, scale: float = 1.0) -> Any:
+    """The transform of rasterio for a grid whose metres are ``scale`` of the map's."""
+    from rasterio.transform import from_origin
 
-    Over the extent of a scan UTM is an affine map of ENU to within a small part of a cell.
+    west_m, north_m, cell_m = (scale * v for v in (grid.west_m, grid.north_m, grid.cell_m))
+    return from_origin(west_m, north_m, cell_m, cell_m)
+
+
+def enu_map(grid: Grid, frame: LocalFrame | None) -> tuple[Any, str]:
+    """Transform and coordinate system of a grid in ENU metres.
+
+    The orthographic map of the ellipsoid (EPSG method 9840) is ENU at height 0: lengths at the
+    origin's height are longer.
     """
-    west, south, east, north = grid.bounds
-    corners = np.array([[west, north, 0.0], [east, north, 0.0], [east, south, 0.0],
-                        [west, south, 0.0]])  # fmt: skip
-    utm = frame.to_utm(corners)[:, :2]
-    out = over((*utm.min(axis=0).tolist(), *utm.max(axis=0).tolist()), grid.cell_m)
-    # Pixel of the old grid as an affine function of the pixel of the new one.
-    A = cv2.getAffineTransform(
-        out.pixels(utm[:3]).astype(np.float32), grid.pixels(corners[:3, :2]).astype(np.float32)
-    )
-    turned = cv2.warpAffine(
-        np.ascontiguousarray(bands.transpose(1, 2, 0)),
-        A,
-        out.shape[::-1],
-        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=[math.nan] * len(bands),
-    )
-    return out, turned.transpose(2, 0, 1)
+    if frame is None:
+        return transform_of(grid), SOME_MAP
+    crs = f"+proj=ortho +lat_0={frame.lat_deg!r} +lon_0={frame.lon_deg!r} +datum=WGS84 +units=m"
+    return transform_of(grid, 1.0 / (1.0 + frame.alt_amsl_m / EARTH_RADIUS_M)), crs
+
+
+def warped(
+    image: Any, transform: Any, crs: str, shape: tuple[int, int], is_smooth: bool = True
+) -> Array:
+    """(bands, rows, cols) of an open raster on another map."""
+    from rasterio.enums import Resampling
+    from rasterio.vrt import WarpedVRT
+
+    grid = {"transform": transform, "crs": crs, "height": shape[0], "width": shape[1]}
+    how = Resampling.bilinear if is_smooth else Resampling.nearest
+    with WarpedVRT(image, src_crs=image.crs or SOME_MAP, resampling=how, **grid) as other:
+        found: Array = other.read()
+        return found
 
 
 MAX_BLOCK_PX = 1 << 22

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,22 +33,41 @@ JPEG_QUALITY = 85
 POINT = np.dtype([("xyz", "<f4", 3), ("bgra", "u1", 4), ("sigma_m", "<f4"), ("views", "u1")])
 
 
+TOPICS = {
+    "PoseInFrame": "/pose",
+    "LocationFix": "/fix",
+    "FrameTransform": "/tf",
+    "PointCloud": "/points",
+    "CompressedImage": "/image",
+    "CameraCalibration": "/camera",
+    "Log": "/log",
+}
+
+
+def write_mcap(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """Keyframes, poses and corrections of the store as MCAP."""
+    with writing(out) as part:
+        export_mcap(scan.store, part)
+
+
 def export_mcap(store: ScanStore, out_path: Path) -> int:
     """Write ``store`` to ``out_path``, in order of time; how many messages that makes.
 
     Raises OutsideError without the ``foxglove-sdk`` package, InputError when the file cannot
     be written.
     """
+    count = 0
     with mcap_file(out_path) as context:
-        recording = _Recording(context)
-        recording.log_header(store)
-        for item in in_order(store.poses(), store.keyframes()):
-            if isinstance(item, PoseRecord):
-                recording.log_pose(item)
-            else:
-                recording.log_keyframe(item, whole_bgr(item, store.image(item.seq)))
-        recording.log_summary(store)
-    return recording.messages
+        from foxglove import channels
+
+        opened = {
+            kind: getattr(channels, f"{kind}Channel")(topic, context=context)
+            for kind, topic in TOPICS.items()
+        }
+        for time_ns, message in _messages(store):
+            opened[type(message).__name__].log(message, log_time=max(time_ns, 0))
+            count += 1
+    return count
 
 
 @contextmanager
@@ -77,110 +97,99 @@ def _time_ns(item: PoseRecord | Keyframe) -> int:
     return item.time_unix_ns if isinstance(item, PoseRecord) else item.time_ns
 
 
-class _Recording:
-    """Channels of one MCAP."""
+def _messages(store: ScanStore) -> Iterator[tuple[int, Any]]:
+    """Unix time in ns and message: the scan's name and notes, its content, its summary."""
+    header = store.header
+    last_ns = header.started_unix_ns
+    origin = f"{header.origin_lat_deg}, {header.origin_lon_deg}, {header.origin_alt_amsl_m} m"
+    text = f"scan {header.name} of {header.drone}, {header.software}, origin {origin}"
+    for line in (text, *header.notes):
+        yield last_ns, _log(line, last_ns)
+    for item in in_order(store.poses(), store.keyframes()):
+        time_ns = _time_ns(item)
+        last_ns = max(last_ns, time_ns)
+        if isinstance(item, PoseRecord):
+            found = _of_pose(item)
+        else:
+            found = _of_keyframe(item, whole_bgr(item, store.image(item.seq)))
+        for message in found:
+            yield time_ns, message
+    if store.summary is not None:
+        yield last_ns, _log(f"finished: {store.summary}", last_ns)
 
-    def __init__(self, context: Any) -> None:
-        from foxglove import channels
 
-        self.messages = 0
-        self._last_ns = 0
-        self._pose = channels.PoseInFrameChannel("/pose", context=context)
-        self._fix = channels.LocationFixChannel("/fix", context=context)
-        self._tf = channels.FrameTransformChannel("/tf", context=context)
-        self._points = channels.PointCloudChannel("/points", context=context)
-        self._image = channels.CompressedImageChannel("/image", context=context)
-        self._camera = channels.CameraCalibrationChannel("/camera", context=context)
-        self._log = channels.LogChannel("/log", context=context)
+def _log(text: str, time_ns: int) -> Any:
+    from foxglove.messages import Log, LogLevel
 
-    def _write(self, channel: Any, message: Any, time_ns: int) -> None:
-        channel.log(message, log_time=max(time_ns, 0))
-        self.messages += 1
-        self._last_ns = max(self._last_ns, time_ns)
+    return Log(timestamp=_stamp(time_ns), level=LogLevel.Info, message=text, name="skyrelief")
 
-    def _say(self, text: str, time_ns: int) -> None:
-        from foxglove import messages
 
-        log = messages.Log(
-            timestamp=_stamp(time_ns), level=messages.LogLevel.Info, message=text, name="skyrelief"
-        )
-        self._write(self._log, log, time_ns)
+def _of_pose(pose: PoseRecord) -> Iterator[Any]:
+    """Where the camera was, in the world and on the globe."""
+    from foxglove import messages
 
-    def log_header(self, store: ScanStore) -> None:
-        """Write a line that names the scan, and its notes."""
-        header = store.header
-        origin = f"{header.origin_lat_deg}, {header.origin_lon_deg}, {header.origin_alt_amsl_m} m"
-        text = f"scan {header.name} of {header.drone}, {header.software}, origin {origin}"
-        for line in (text, *header.notes):
-            self._say(line, header.started_unix_ns)
-
-    def log_summary(self, store: ScanStore) -> None:
-        if store.summary is not None:
-            self._say(f"finished: {store.summary}", self._last_ns)
-
-    def log_pose(self, pose: PoseRecord) -> None:
-        """Where the camera was, in the world and on the globe."""
-        from foxglove import messages
-
-        time_ns = pose.time_unix_ns
-        stamp = _stamp(time_ns)
-        T = pose.T_world_camera
-        self._write(
-            self._pose,
-            messages.PoseInFrame(timestamp=stamp, frame_id="world", pose=_pose(T)),
-            time_ns,
-        )
-        position, rotation = _parts(T)
-        self._write(
-            self._tf,
-            messages.FrameTransform(
-                timestamp=stamp,
-                parent_frame_id="world",
-                child_frame_id="camera",
-                translation=position,
-                rotation=rotation,
-            ),
-            time_ns,
-        )
-        if pose.lat_deg is None or pose.lon_deg is None:
-            return
-        fix = messages.LocationFix(
+    stamp = _stamp(pose.time_unix_ns)
+    position, rotation = _parts(pose.T_world_camera)
+    place = messages.Pose(position=position, orientation=rotation)
+    yield messages.PoseInFrame(timestamp=stamp, frame_id="world", pose=place)
+    yield messages.FrameTransform(
+        timestamp=stamp,
+        parent_frame_id="world",
+        child_frame_id="camera",
+        translation=position,
+        rotation=rotation,
+    )
+    if pose.lat_deg is not None and pose.lon_deg is not None:
+        yield messages.LocationFix(
             timestamp=stamp,
             frame_id="camera",
             latitude=pose.lat_deg,
             longitude=pose.lon_deg,
             altitude=pose.alt_amsl_m or 0.0,
-            position_covariance=[float(v) for v in pose.position_covariance.ravel()],
+            position_covariance=pose.position_covariance.ravel().tolist(),
             position_covariance_type=messages.LocationFixPositionCovarianceType.Known,
         )
-        self._write(self._fix, fix, time_ns)
 
-    def log_keyframe(self, keyframe: Keyframe, bgr: U8) -> None:
-        """The keyframe's points, its image ``bgr`` and camera."""
-        import cv2
-        from foxglove import messages
 
-        time_ns = keyframe.time_ns
-        stamp = _stamp(time_ns)
-        frame_id = f"keyframe-{keyframe.seq}"
-        self._write(self._points, _points(keyframe, stamp), time_ns)
-        _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        image = messages.CompressedImage(
-            timestamp=stamp, frame_id=frame_id, data=jpeg.tobytes(), format="jpeg"
-        )
-        self._write(self._image, image, time_ns)
-        h, w = keyframe.depth.depth_m.shape
-        K = [float(v) for v in keyframe.depth.K.ravel()]
-        camera = messages.CameraCalibration(
-            timestamp=stamp,
-            frame_id=frame_id,
-            width=w,
-            height=h,
-            K=K,
-            P=[*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0],
-            R=[float(v) for v in np.eye(3).ravel()],
-        )
-        self._write(self._camera, camera, time_ns)
+def _of_keyframe(keyframe: Keyframe, bgr: U8) -> Iterator[Any]:
+    """The keyframe's points, placed by its pose, its image ``bgr`` and camera."""
+    from foxglove import messages
+
+    stamp, depth = _stamp(keyframe.time_ns), keyframe.depth
+    real, byte = (getattr(messages.PackedElementFieldNumericType, k) for k in ("Float32", "Uint8"))
+    fields = (
+        ("x", 0, real), ("y", 4, real), ("z", 8, real), ("blue", 12, byte), ("green", 13, byte),
+        ("red", 14, byte), ("alpha", 15, byte), ("sigma_m", 16, real), ("views", 20, byte),
+    )  # fmt: skip
+    position, orientation = _parts(depth.T_world_camera)
+    yield messages.PointCloud(
+        timestamp=stamp,
+        frame_id="world",
+        pose=messages.Pose(position=position, orientation=orientation),
+        point_stride=POINT.itemsize,
+        fields=[messages.PackedElementField(name=n, offset=at, type=t) for n, at, t in fields],
+        data=known_points(keyframe).tobytes(),
+    )
+    frame_id = f"keyframe-{keyframe.seq}"
+    yield messages.CompressedImage(
+        timestamp=stamp, frame_id=frame_id, data=jpeg(bgr).tobytes(), format="jpeg"
+    )
+    h, w = depth.depth_m.shape
+    yield messages.CameraCalibration(
+        timestamp=stamp,
+        frame_id=frame_id,
+        width=w,
+        height=h,
+        K=depth.K.ravel().tolist(),
+        P=np.column_stack([depth.K, np.zeros(3)]).ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+    )
+
+
+def jpeg(bgr: U8) -> U8:
+    """(N,) bytes of an image."""
+    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    return np.asarray(cv2.imencode(".jpg", bgr, quality)[1], np.uint8).ravel()
 
 
 def known_points(keyframe: Keyframe) -> NDArray[np.void]:
@@ -199,35 +208,6 @@ def known_points(keyframe: Keyframe) -> NDArray[np.void]:
     return points
 
 
-def _points(keyframe: Keyframe, stamp: Any) -> Any:
-    """The keyframe's points, placed by the camera's pose."""
-    from foxglove.messages import PackedElementField, PackedElementFieldNumericType, PointCloud
-
-    real, byte = PackedElementFieldNumericType.Float32, PackedElementFieldNumericType.Uint8
-    fields = [
-        PackedElementField(name=name, offset=offset, type=kind)
-        for name, offset, kind in (
-            ("x", 0, real),
-            ("y", 4, real),
-            ("z", 8, real),
-            ("blue", 12, byte),
-            ("green", 13, byte),
-            ("red", 14, byte),
-            ("alpha", 15, byte),
-            ("sigma_m", 16, real),
-            ("views", 20, byte),
-        )
-    ]
-    return PointCloud(
-        timestamp=stamp,
-        frame_id="world",
-        pose=_pose(keyframe.depth.T_world_camera),
-        point_stride=POINT.itemsize,
-        fields=fields,
-        data=known_points(keyframe).tobytes(),
-    )
-
-
 def _stamp(time_ns: int) -> Any:
     from foxglove.messages import Timestamp
 
@@ -236,23 +216,9 @@ def _stamp(time_ns: int) -> Any:
 
 
 def _parts(T: F64) -> tuple[Any, Any]:
+    """Position and orientation of a pose."""
     from foxglove.messages import Quaternion, Vector3
 
     w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(T[:3, :3]))
-    return (
-        Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
-        Quaternion(x=x, y=y, z=z, w=w),
-    )
-
-
-def _pose(T: F64) -> Any:
-    from foxglove.messages import Pose
-
-    position, orientation = _parts(T)
-    return Pose(position=position, orientation=orientation)
-
-
-def write_mcap(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Keyframes, poses and corrections of the store as MCAP."""
-    with writing(out) as part:
-        export_mcap(scan.store, part)
+    place = Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3]))
+    return place, Quaternion(x=x, y=y, z=z, w=w)

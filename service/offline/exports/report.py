@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from recon.surface.raster import Grid, Raster
-from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.offline.exports.maps import resampled
-from service.offline.exports.rasters import NODATA_M, open_map, over
+from service.offline.exports.rasters import NODATA_M, enu_map, open_map, over, warped
 from service.offline.exports.view import ExportOptions, ScanView
+from service.offline.tiles import box_around
 from service.scans.coverage import coverage_of
 from service.scans.folder import stages_jpg, surface
 from service.scans.report import report_html
@@ -57,20 +56,12 @@ def maps_of(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | No
     if min(p.stat().st_mtime_ns for p in (ortho, dsm)) < made.stat().st_mtime_ns:
         return None
     zero_m = 0.0 if frame is None else frame.alt_amsl_m
-
-    def to_map(xy: F64) -> F64:
-        places = np.column_stack([xy, np.zeros(len(xy))])
-        return (places if frame is None else frame.to_utm(places))[:, :2]
-
     with open_map(dsm, 2) as image, open_map(ortho, 3) as colours:
         if image.tags().get("HEIGHTS") != heights:
             return None
         grid = _in_enu(image, colours, frame)
-        x, y = (np.arange(n, dtype=np.float64) + 0.5 for n in grid.shape[::-1])
-        axes = grid.west_m + x * grid.cell_m, grid.north_m - y * grid.cell_m
-        found = resampled(image, 2, *axes, to_map, NODATA_M)
-        rgb = resampled(colours, 3, *axes, to_map)
-    height, sigma = np.moveaxis(found, 2, 0)
+        height, sigma, *_ = warped(image, *enu_map(grid, frame), grid.shape, is_smooth=False)
+        rgb = warped(colours, *enu_map(grid, frame), grid.shape)[:3].transpose(1, 2, 0)
     known = height != NODATA_M
     return Raster(
         grid,
@@ -82,9 +73,6 @@ def maps_of(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | No
 
 def _in_enu(dsm: Any, ortho: Any, frame: LocalFrame | None) -> Grid:
     """A grid over the surface model as fine as the orthophoto, or as LARGEST_CELLS allow."""
-    west, south, east, north = dsm.bounds
-    corners = np.array([[x, y, 0.0] for x in (west, east) for y in (south, north)])
-    enu = corners if frame is None else frame.from_utm(corners)
-    (west, south), (east, north) = enu[:, :2].min(axis=0), enu[:, :2].max(axis=0)
+    west, south, east, north = box_around(dsm.bounds, None if frame is None else frame.from_utm)
     cell_m = max(ortho.transform.a, max(east - west, north - south) / LARGEST_CELLS)
-    return over((float(west), float(south), float(east), float(north)), float(cell_m))
+    return over((west, south, east, north), float(cell_m))

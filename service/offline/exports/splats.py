@@ -11,7 +11,7 @@ from recon import se3
 from recon.surface.splats import Splats, joined, splats_of, steps
 from recon.types import F32, F64, Bool
 from service.errors import InputError
-from service.offline.exports.clouds import VOXELS_MARGIN_M
+from service.offline.exports.clouds import VOXELS_MARGIN_M, ply_head
 from service.offline.exports.images import resized, shared_images
 from service.offline.exports.model import LARGEST_FACES, closed_surface
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
@@ -53,7 +53,7 @@ def write_splats(scan: ScanView, out: Path, options: ExportOptions) -> None:
     if spz:
         with needing("an SPZ file"):
             import gaussforge
-    splats = joined(list(in_parts(scan, _made, options, VOXELS_MARGIN_M, needs_cell=False)))
+    splats = joined(list(in_parts(scan, _made, options, VOXELS_MARGIN_M)))
     if spz and np.abs(splats.xyz_m).max() >= SPZ_REACH_M:
         raise InputError(f"{out}: SPZ reaches {SPZ_REACH_M:.0f} m from the origin; write .ply")
     scan.progress(f"writing {len(splats)} Gaussians")
@@ -129,9 +129,8 @@ def ply(splats: Splats, comment: str) -> bytes:
     rows[:, 9] = np.log(splats.opacity / (1.0 - splats.opacity))
     rows[:, 10:13] = np.log(splats.sigma_m)
     rows[:, 13:17] = splats.q_wxyz
-    head = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
-    head += [f"element vertex {len(rows)}", *(f"property float {name}" for name in FIELDS)]
-    return "\n".join([*head, "end_header", ""]).encode("ascii") + rows.astype("<f4").tobytes()
+    head = ply_head(comment, len(rows), [("float", name) for name in FIELDS])
+    return head + rows.astype("<f4").tobytes()
 
 
 def read_splats(path: Path) -> Splats:

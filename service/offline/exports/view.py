@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -81,6 +80,15 @@ class ExportOptions:
         return "height_amsl_m" if is_amsl else "height_m"
 
 
+NO_POINTS = "contains no points yet; nothing to export"
+
+
+class NoPointsError(InputError):
+    """A scan, or a tile of it, has not a single point."""
+
+
+USUAL = ExportOptions()
+
 Make = Callable[["ScanView", ExportOptions, Box], T | None]
 """Makes the part of a product in a box; a module's own function, so that it can travel."""
 
@@ -92,21 +100,6 @@ class ProductJob:
     tile: Tile
     make: Make[Any]
     options: ExportOptions
-
-
-class _Once(Generic[T]):
-    """A value that the first thread makes which asks; the others wait for it."""
-
-    def __init__(self) -> None:
-        self._making = threading.Lock()
-        self._made: list[T] = []
-
-    def get(self, make: Callable[[], T]) -> T:
-        """The value; what ``make`` raises is raised, and the next thread makes it."""
-        with self._making:
-            if not self._made:
-                self._made.append(make())
-            return self._made[0]
 
 
 class ScanView:
@@ -129,7 +122,8 @@ class ScanView:
         self.store = ScanStore.open(folder / "scan.db")
         self._voxel_m = voxel_m
         self.progress = progress or Progress()
-        self._shared: dict[Any, _Once[Any]] = {}
+        self._shared: dict[Any, Any] = {}
+        self._making: dict[Any, threading.Lock] = {}
         self._lock = threading.Lock()
         self._datums: tuple[str, str] | None = None  # heights from the first to the second
         self._box = EVERYWHERE
@@ -141,12 +135,7 @@ class ScanView:
     def __enter__(self) -> ScanView:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.store.close()
 
     def with_progress(self, progress: Progress) -> ScanView:
@@ -169,10 +158,16 @@ class ScanView:
         return other
 
     def shared(self, key: Any, make: Callable[[], T]) -> T:
-        """What several deliverables are made from, made once; other threads wait for it."""
+        """What several deliverables are made from: the first thread that asks makes it, the others
+        wait. What ``make`` raises is raised, and the next thread makes it."""
+        key = self._datums, key
         with self._lock:
-            one: _Once[T] = self._shared.setdefault((self._datums, key), _Once())
-        return one.get(make)
+            making = self._making.setdefault(key, threading.Lock())
+        with making:
+            if key not in self._shared:
+                self._shared[key] = make()
+            found: T = self._shared[key]
+            return found
 
     @cached_property
     def frame(self) -> LocalFrame | None:
@@ -218,30 +213,24 @@ class ScanView:
         with self.progress.part("fusing the cloud", FUSING):
             fused = fused_cloud(self.store, self._voxel_m, self.progress, self._box)
         if not len(fused.cloud):
-            raise InputError(f"{self.folder} contains no points yet; nothing to export")
+            raise NoPointsError(f"{self.folder} {NO_POINTS}")
         return fused
 
-    @property
-    def has_points(self) -> bool:
-        try:
-            return bool(len(self.fused.cloud))
-        except InputError:
-            return False
-
-    def tiling(self, options: ExportOptions, margin_m: float) -> Tiling:
-        """Tiles over the scan in its UTM zone, each with the points ``margin_m`` around it."""
+    def tiling(self, options: ExportOptions, margin_m: float, on_map: bool = True) -> Tiling:
+        """Tiles over the scan in its UTM zone, or in ENU metres, each with the points ``margin_m``
+        around it."""
+        frame, voxel_m = self.frame if on_map else None, options.voxel_m or self._voxel_m
         return self.shared(
-            ("tiling", margin_m, options.tile_points),
-            lambda: tiling(self.folder, self.store, options.tile_points, margin_m, self.frame),
+            ("tiling", margin_m, options.tile_points, voxel_m, on_map),
+            lambda: tiling(self.folder, self.store, options.tile_points, margin_m, frame, voxel_m),
         )
 
-    def for_tiles(
-        self, options: ExportOptions, cut: Tiling, needs_cell: bool = True
-    ) -> ExportOptions:
-        """The options with the sizes that tiles by themselves would choose differently."""
+    def for_tiles(self, options: ExportOptions, cut: Tiling) -> ExportOptions:
+        """The options with what tiles by themselves, maybe elsewhere, would choose differently."""
         voxel = options.voxel_m or self._voxel_m or cut.sample_m
-        cell = options.cell_m or (round_cell(voxel, up=True) if needs_cell else None)
-        return replace(options, voxel_m=voxel, cell_m=cell)
+        cell = options.cell_m or round_cell(voxel, up=True)
+        video = None if options.video is None else options.video.resolve()
+        return replace(options, voxel_m=voxel, cell_m=cell, video=video)
 
     @property
     def xyz_m(self) -> F64:
@@ -250,9 +239,12 @@ class ScanView:
 
     def grid(self, cell_m: float | None) -> Grid:
         """A grid over ``xyz_m``, by default of round cells as large as the voxels at least."""
-        cell = cell_m or round_cell(self.fused.voxel_m, up=True)
+        return self.grid_of(self.xyz_m, cell_m or round_cell(self.fused.voxel_m, up=True))
+
+    def grid_of(self, xyz_m: F64, cell_m: float) -> Grid:
+        """A grid over places (N, 3) with a cell around them; InputError where it is too large."""
         try:
-            return grid_over(self.xyz_m[:, :2], cell, margin_cells=1)
+            return grid_over(xyz_m[:, :2], cell_m, margin_cells=1)
         except ValueError as error:
             raise InputError(f"{self.folder}: {error} with --cell-m") from error
 
@@ -316,19 +308,25 @@ def check(
 
 
 def in_parts(
-    scan: ScanView, make: Make[T], options: ExportOptions, margin_m: float, needs_cell: bool = True
+    scan: ScanView,
+    make: Make[T],
+    options: ExportOptions,
+    margin_m: float,
+    on_map: bool = True,
+    nothing: str = NO_POINTS,
 ) -> Iterator[T]:
     """A product as a whole, or tile by tile where there are more points than one may have.
 
-    Each tile is made from its points and those ``margin_m`` around it. Raises InputError, at the
-    first, when there is not a single point.
+    Each tile, whose box is as :meth:`ScanView.tiling` has it, is made from its points and those
+    ``margin_m`` around it. Raises InputError, at the first, when no tile has anything; ``nothing``
+    is the reason.
     """
-    cut = scan.tiling(options, margin_m)
+    cut = scan.tiling(options, margin_m, on_map)
     parts: Iterator[T | None]
     if len(cut.tiles) == 1:
         parts = iter([make(scan, options, EVERYWHERE)])
     else:
-        fixed = scan.for_tiles(options, cut, needs_cell)
+        fixed = scan.for_tiles(options, cut)
         jobs = [ProductJob(tile, make, fixed) for tile in cut.tiles]
         parts = run_tiles(make_part, jobs, options.scheduler, scan.progress)
     count = 0
@@ -337,12 +335,13 @@ def in_parts(
             count += 1
             yield part
     if not count:
-        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+        raise InputError(f"{scan.folder} {nothing}")
 
 
 def make_part(job: ProductJob, progress: Progress | None = None) -> Any:
     """One tile of a product; None without any points."""
     with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as scan:
-        if not scan.has_points:
+        try:
+            return job.make(scan.converted(job.options), job.options, job.tile.box)
+        except NoPointsError:
             return None
-        return job.make(scan.converted(job.options), job.options, job.tile.box)

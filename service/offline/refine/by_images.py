@@ -38,7 +38,7 @@ from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.refine import own_camera
 from service.offline.refine.control_points import MARK_PX, Candidate
-from service.offline.refine.revisions import KeyframeState, moved_frames
+from service.offline.refine.revisions import KeyframeStates, moved_frames
 from service.offline.refine.survey_file import SurveyPoint
 from service.scans.track import camera_of
 from service.stream.records import PoseRecord, ScanHeader
@@ -54,7 +54,7 @@ MIN_FIXES = 3
 MIN_DEPTHS = 8
 """Places that a depth image has to show before it is scaled to them."""
 
-Surfaces = Callable[[KeyframeState], Keyframe | None]
+Surfaces = Callable[[int], Keyframe | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +106,7 @@ def stretches_untied(seqs: Sequence[int], seen: Sightings, fixed: Bool) -> list[
 
 
 def network_of(
-    video: Path, header: ScanHeader, states: Sequence[KeyframeState],
+    video: Path, header: ScanHeader, states: KeyframeStates,
     marked: Sequence[PoseRecord], ahead_m: float,
 ) -> ImageNetwork:  # fmt: skip
     """The images of the keyframes, and of the frames ``marked``, tied together.
@@ -114,8 +114,8 @@ def network_of(
     Raises InputError when ``video`` is not the scan's.
     """
     given = camera_of(header)
-    times = [s.time_ns for s in states] + [f.time_unix_ns for f in marked]
-    poses = np.array([s.T_world_camera for s in states] + [f.T_world_camera for f in marked])
+    times = [*states.times_ns.tolist(), *(f.time_unix_ns for f in marked)]
+    poses = np.array([*states.poses, *(f.T_world_camera for f in marked)])
     images = own_camera.images_at(video, header.started_unix_ns, times)
     ground_m = float(np.median((poses[:, :3, 3] + ahead_m * poses[:, :3, 2])[:, 2]))
     tied = own_camera.sightings(images, given, poses, ground_m)
@@ -137,10 +137,9 @@ def network_of(
 
 
 def marked_frames(
-    survey: Sequence[SurveyPoint], frames: Sequence[PoseRecord], states: Sequence[KeyframeState]
+    survey: Sequence[SurveyPoint], frames: Sequence[PoseRecord], states: KeyframeStates
 ) -> list[PoseRecord]:
     """Frames other than keyframes in which surveyed points are marked."""
-    keys = np.array([s.time_ns for s in states])
     wanted = {
         round(seen.time_unix_s * 1e9)
         for point in survey
@@ -150,44 +149,38 @@ def marked_frames(
     out = {}
     for time_ns in wanted:
         near = min(frames, key=lambda f: abs(f.time_unix_ns - time_ns), default=None)
-        if near is not None and np.abs(keys - time_ns).min() >= 2_000_000:
+        if near is not None and np.abs(states.times_ns - time_ns).min() >= 2_000_000:
             out[near.time_unix_ns] = near
     return [out[t] for t in sorted(out)]
 
 
 def as_seen(
-    found: ImageNetwork, states: Sequence[KeyframeState], frames: Sequence[PoseRecord],
+    found: ImageNetwork, states: KeyframeStates, frames: Sequence[PoseRecord],
     marked: Sequence[PoseRecord], surface: Surfaces,
-) -> tuple[list[KeyframeState], list[PoseRecord]]:  # fmt: skip
+) -> tuple[KeyframeStates, list[PoseRecord]]:  # fmt: skip
     """Keyframes and frames as the images have them."""
     n = len(states)
-    scales = depth_scales(found, found.poses, found.points, found.seen, states, surface)
-    spread = np.array([s.covariance for s in states])
-    moved = moved_frames(frames, states, Adjusted(found.poses[:n], spread, scales, {}, ()), None)
+    scales = depth_scales(found, found.poses, found.points, found.seen, surface)
+    after = Adjusted(found.poses[:n], states.covariances, scales, {}, ())
+    moved = moved_frames(frames, states, after, None)
     own = {f.time_unix_ns: T for f, T in zip(marked, found.poses[n:], strict=True)}
     moved = [replace(f, T_world_camera=own.get(f.time_unix_ns, f.T_world_camera)) for f in moved]
-    poses = [
-        replace(s, T_world_camera=T, scale=s.scale * float(scale))
-        for s, T, scale in zip(states, found.poses[:n], scales, strict=True)
-    ]
-    return poses, moved
+    return replace(states, poses=found.poses[:n], scales=states.scales * scales), moved
 
 
 def in_world(images: ImageNetwork, move: Similarity) -> ImageNetwork:
     """The network in the world that a similarity takes it to."""
-    poses = np.array([move.pose(T) for T in images.poses])
-    return replace(images, poses=poses, points=move.points(images.points))
+    return replace(images, poses=move.pose(images.poses), points=move.points(images.points))
 
 
 def depth_scales(
-    found: ImageNetwork, poses: F64, points: F64, seen: Sightings,
-    states: Sequence[KeyframeState], surface: Surfaces,
-) -> F64:  # fmt: skip
+    found: ImageNetwork, poses: F64, points: F64, seen: Sightings, surface: Surfaces
+) -> F64:
     """(N,) what the depth of each keyframe is multiplied by to meet the places that it shows."""
     flat = rays(found.given.K, without_distortion(found.given, seen.uv_px))
 
     def scale(k: int) -> float:
-        keyframe = surface(states[k])
+        keyframe = surface(k)
         rows = np.flatnonzero(seen.view == k)
         if keyframe is None or len(rows) < MIN_DEPTHS:
             return np.nan
@@ -200,14 +193,14 @@ def depth_scales(
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
         return float(np.median(ratio)) if len(ratio) >= MIN_DEPTHS else np.nan
 
-    out = np.array(run_parallel(*(partial(scale, k) for k in range(len(states)))))
+    out = np.array(run_parallel(*(partial(scale, k) for k in range(found.keyframes))))
     usual = float(np.nanmedian(out)) if np.isfinite(out).any() else 1.0
     return np.where(np.isfinite(out), out, usual)
 
 
 def adjusted(
     images: ImageNetwork, track: KeyframeTrack, points: Sequence[ControlPoint],
-    marks: Sequence[Mark], states: Sequence[KeyframeState], surface: Surfaces,
+    marks: Sequence[Mark], surface: Surfaces,
 ) -> tuple[Adjusted, ImageNetwork]:  # fmt: skip
     """The adjustment with telemetry and surveyed points, and the network after it.
 
@@ -231,7 +224,7 @@ def adjusted(
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         raise InputError(f"the images do not tie the scan together ({error})") from error
     s = found.solution
-    scales = depth_scales(images, s.poses, s.points, found.seen, states, surface)
+    scales = depth_scales(images, s.poses, s.points, found.seen, surface)
     after = replace(images, camera=s.camera, poses=s.poses, seen=found.seen)
     return Adjusted(s.poses[:n], s.covariances[:n], scales, _residuals(found, known), ()), after
 

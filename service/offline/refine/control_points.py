@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
-import cv2
 import numpy as np
 
 from recon import se3
-from recon.camera_model import project
+from recon.calibration.tracks import without_distortion
+from recon.camera_model import project, rays
 from recon.posegraph.ground_control import Mark, consenting, map_position
 from recon.similarity import Similarity, umeyama
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.offline.refine.revisions import KeyframeState
+from service.offline.refine.revisions import KeyframeStates
 from service.offline.refine.survey_file import Sighting, SurveyPoint
 from service.scans.track import camera_of
 from service.stream.records import PoseRecord, ScanHeader
@@ -93,16 +93,11 @@ class Candidate:
 class ScanImages:
     """Parts of a scan that marks refer to."""
 
-    states: Sequence[KeyframeState]
+    states: KeyframeStates
     frames: Sequence[PoseRecord]
     header: ScanHeader
-    keyframe: Callable[[KeyframeState], Keyframe | None]
+    keyframe: Callable[[int], Keyframe | None]
     frame: LocalFrame | None
-
-    @property
-    def poses(self) -> F64:
-        """(N, 4, 4) unrefined."""
-        return np.array([s.T_world_camera for s in self.states])
 
 
 def candidates_of(survey: Sequence[SurveyPoint], scan: ScanImages, path: str) -> list[Candidate]:
@@ -116,7 +111,7 @@ def candidates_of(survey: Sequence[SurveyPoint], scan: ScanImages, path: str) ->
                 one.marks += _in_map(seen, number, scan, where)
             else:
                 one.marks.append(_in_image(seen, number, scan, where))
-        found = map_position(scan.poses, np.ones(len(scan.states)), one.marks)
+        found = map_position(scan.states.poses, np.ones(len(scan.states)), one.marks)
         if found is None:
             one.why_not = "the map has no surface at its mark; mark it in a second image"
         else:
@@ -137,13 +132,12 @@ def _in_image(seen: Sighting, number: int, scan: ScanImages, where: str) -> Mark
         raise InputError(
             f"{where}: pixel {u:g}, {v:g} is outside the camera's image of {width}x{height}"
         )
-    flat = cv2.undistortPoints(np.array([[[u, v]]]), camera.K, camera.distortion)[0, 0]
-    ray = np.array([flat[0], flat[1], 1.0])
+    ray = rays(camera.K, without_distortion(camera, np.array([[u, v]])))[0]
     sigma = MARK_PX / float(camera.K[0, 0])
     index, T = _image(seen, scan, where)
     if not np.array_equal(T, np.eye(4)):
         return Mark(number, index, ray, sigma, T_key_camera=T)
-    depth = _surface_at(scan.keyframe(scan.states[index]), ray)
+    depth = _surface_at(scan.keyframe(index), ray)
     if depth is None:
         return Mark(number, index, ray, sigma)
     return Mark(number, index, ray, sigma, depth[0], depth[1])
@@ -151,7 +145,7 @@ def _in_image(seen: Sighting, number: int, scan: ScanImages, where: str) -> Mark
 
 def _image(seen: Sighting, scan: ScanImages, where: str) -> tuple[int, F64]:
     """The keyframe that a mark refers to, and the image's pose in its camera."""
-    seqs = [s.seq for s in scan.states]
+    seqs, keys = scan.states.seqs, scan.states.times_ns
     if seen.keyframe_seq is not None:
         if seen.keyframe_seq not in seqs:
             near = min(seqs, key=lambda s: abs(s - (seen.keyframe_seq or 0)))
@@ -159,7 +153,6 @@ def _image(seen: Sighting, scan: ScanImages, where: str) -> tuple[int, F64]:
         return seqs.index(seen.keyframe_seq), np.eye(4)
     assert seen.time_unix_s is not None
     time_ns = round(seen.time_unix_s * 1e9)
-    keys = np.array([s.time_ns for s in scan.states])
     nearest = int(np.argmin(np.abs(keys - time_ns)))
     if abs(int(keys[nearest]) - time_ns) < 2_000_000:
         return nearest, np.eye(4)
@@ -167,7 +160,7 @@ def _image(seen: Sighting, scan: ScanImages, where: str) -> tuple[int, F64]:
     k = int(np.argmin(np.abs(times - time_ns))) if len(times) else -1
     if k < 0 or abs(int(times[k]) - time_ns) > 20_000_000:
         raise InputError(f"{where}: no image within 20 ms of time {seen.time_unix_s:.3f}")
-    T = se3.inverse(scan.states[nearest].T_world_camera) @ scan.frames[k].T_world_camera
+    T = se3.inverse(scan.states.poses[nearest]) @ scan.frames[k].T_world_camera
     return nearest, T
 
 
@@ -198,11 +191,11 @@ def _in_map(seen: Sighting, number: int, scan: ScanImages, where: str) -> list[M
     place = np.array([seen.xyz_m])
     spot = place[0] if scan.frame is None else scan.frame.from_utm(place)[0]
     found = []
-    for index, state in enumerate(scan.states):
-        p = se3.transform(se3.inverse(state.T_world_camera), spot[None])[0]
+    for index, T in enumerate(scan.states.poses):
+        p = se3.transform(se3.inverse(T), spot[None])[0]
         if p[2] <= 0 or np.abs(p[:2]).max() > 3.0 * p[2]:
             continue
-        surface = _surface_at(scan.keyframe(state), p / p[2])
+        surface = _surface_at(scan.keyframe(index), p / p[2])
         if surface is None or abs(surface[0] - p[2]) > 4.0 * surface[1] + 0.01 * p[2]:
             continue
         sigma = 0.5 / float(scan.header.camera["K"][0]) if "K" in scan.header.camera else 1e-3
@@ -221,9 +214,7 @@ def _in_map(seen: Sighting, number: int, scan: ScanImages, where: str) -> list[M
 def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
     """Note against each point what speaks against it: far off, or against all the others."""
     for one in candidates:
-        p = one.point
-        place = np.array([[p.lat_deg, p.lon_deg, p.alt_amsl_m or frame.alt_amsl_m]])
-        one.surveyed_m = frame.to_enu(place)[0]
+        one.surveyed_m = one.point.enu(frame)
     _lift(candidates)
     for one in candidates:
         if one.usable and one.before_m is not None:
@@ -244,16 +235,14 @@ def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
         return
     for one, fits, off in zip(voters, agree, surveyed - mapped - usual, strict=True):
         if not fits:
-            one.why_not = (
-                f"{off[0]:+.2f} m east, {off[1]:+.2f} m north, {off[2]:+.2f} m up "
-                "against the other points"
-            )
+            one.why_not = f"{_in_words(off)} against the other points"
     while (odd := _odd_one([c for c in voters if c.usable])) is not None:
         one, off = odd
-        one.why_not = (
-            f"{off[0]:+.2f} m east, {off[1]:+.2f} m north, {off[2]:+.2f} m up "
-            "from where the other points put it"
-        )
+        one.why_not = f"{_in_words(off)} from where the other points put it"
+
+
+def _in_words(off_m: F64) -> str:
+    return f"{off_m[0]:+.2f} m east, {off_m[1]:+.2f} m north, {off_m[2]:+.2f} m up"
 
 
 def _lift(candidates: Sequence[Candidate]) -> None:
@@ -326,7 +315,7 @@ def _far(one: Candidate, frame: LocalFrame) -> str:
         ):
             if abs(lat) > 90.0:
                 continue
-            there = frame.to_enu(np.array([[lat, lon, p.alt_amsl_m or frame.alt_amsl_m]]))[0]
+            there = replace(p, lat_deg=lat, lon_deg=lon).enu(frame)
             if np.linalg.norm((there - one.before_m)[:2]) < 20.0 * FAR_M:
                 return f"{_metres(flat)} from its place in the map: {hint}"
         return f"{_metres(flat)} from its place in the map: wrong point, zone or sign"
@@ -359,8 +348,7 @@ def place_by_survey(candidates: Sequence[Candidate]) -> tuple[LocalFrame, Simila
     first = voters[0].point
     frame = LocalFrame(first.lat_deg, first.lon_deg, heights[0] if heights else 0.0)
     level = len(heights) < len(voters)
-    geodetic = [(c.point.lat_deg, c.point.lon_deg, c.point.alt_amsl_m or 0.0) for c in voters]
-    surveyed = frame.to_enu(np.array(geodetic))
+    surveyed = np.array([c.point.enu(frame) for c in voters])
     mapped = np.array([c.before_m for c in voters])
     best, most = None, np.zeros(len(voters), np.bool_)
     for triple in list(combinations(range(len(voters)), 3))[:MAX_TRIPLES]:

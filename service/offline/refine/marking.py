@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from recon.calibration.tracks import with_distortion, without_distortion
 from recon.camera_model import project, rays, scaled
 from recon.similarity import Similarity
 from recon.types import F64, U8, Camera
@@ -73,17 +74,15 @@ class Marking:
     """The control points of an open scan. Raises InputError when it has no keyframes or camera."""
 
     def __init__(self, store: ScanStore) -> None:
-        revisions = Revisions(store)
-        found = (revisions.keyframe_state(seq, NEWEST) for seq in store.seqs())
-        states = sorted((s for s in found if s is not None), key=lambda s: s.time_ns)
-        if not states:
+        states = Revisions(store).states(NEWEST)
+        if not len(states):
             raise InputError("no keyframes yet")
         self.camera = camera_of(store.header)
         self._scan = ScanImages(
-            states, store.poses(), store.header, lambda s: store.keyframe(s.seq),
+            states, store.poses(), store.header, lambda k: store.keyframe(states.seqs[k]),
             local_frame(store.header),
         )  # fmt: skip
-        self._poses = self._scan.poses
+        self._poses = states.poses
         self._ahead_m = cache(self._distance_m)  # many points have the same images nearest
 
     def of(self, survey: Sequence[SurveyPoint]) -> list[Marked]:
@@ -118,14 +117,14 @@ class Marking:
         except InputError:  # too few yet
             return None, same
         for one in candidates:
-            one.surveyed_m = _enu(one.point, frame)
+            one.surveyed_m = one.point.enu(frame)
         return frame, move
 
     def _expected(
         self, point: SurveyPoint, frame: LocalFrame, to_survey: Similarity, usual: F64
     ) -> F64:
         """(3,) where the map should have a point, off as the marked ones are."""
-        spot = _enu(point, frame) + usual
+        spot = point.enu(frame) + usual
         spot = to_survey.R.T @ (spot - to_survey.t) / to_survey.scale
         if point.alt_amsl_m is None:
             spot[2] = self._ground_m(spot)
@@ -143,7 +142,7 @@ class Marking:
 
     def _distance_m(self, k: int) -> float | None:
         """Median distance of what a keyframe sees, along its axis."""
-        keyframe = self._scan.keyframe(self._scan.states[k])
+        keyframe = self._scan.keyframe(k)
         if keyframe is None or not np.isfinite(keyframe.depth.depth_m).any():
             return None
         return float(np.nanmedian(keyframe.depth.depth_m))
@@ -151,7 +150,7 @@ class Marking:
     def _images(self, point: SurveyPoint, expected: F64 | None) -> list[Shown]:
         """Those marked, and those that see the point best; any where its place is not known."""
         marked = {s.keyframe_seq: s.uv_px for s in point.sightings if s.keyframe_seq is not None}
-        seqs = [s.seq for s in self._scan.states]
+        seqs = self._scan.states.seqs
         uv = np.full((len(seqs), 2), np.nan)
         if expected is None:
             step = max(1, len(seqs) // (4 * MAX_IMAGES))
@@ -175,14 +174,8 @@ class Marking:
         inside = ((flat > wide[0]) & (flat < wide[1]))[:, :2].all(axis=1)
         out = np.full((len(flat), 2), np.nan)
         if inside.any():
-            out[inside] = distorted(self.camera, flat[inside])
+            out[inside] = with_distortion(self.camera, project(self.camera.K, flat[inside]))
         return out
-
-
-def distorted(camera: Camera, flat: F64) -> F64:
-    """(N, 2) pixels of a camera's own image of rays (N, 3) with z = 1."""
-    found = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), camera.K, camera.distortion)[0]
-    return np.asarray(found[:, 0], np.float64)
 
 
 def image_of(folder: Path, store: ScanStore, seq: int) -> bytes:
@@ -195,7 +188,7 @@ def image_of(folder: Path, store: ScanStore, seq: int) -> bytes:
     bgr = _recorded(folder, store, keyframe.time_ns)
     if bgr is None:
         whole, K = whole_bgr(keyframe, store.image(seq)), keyframe.depth.K
-        bgr = with_distortion(whole, K, camera_of(store.header))
+        bgr = _distorted(whole, K, camera_of(store.header))
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     return cv2.imencode(".jpg", bgr, quality)[1].tobytes()
 
@@ -211,22 +204,15 @@ def _recorded(folder: Path, store: ScanStore, time_ns: int) -> U8 | None:
         return None
 
 
-def with_distortion(flat: U8, K: F64, camera: Camera) -> U8:
+def _distorted(flat: U8, K: F64, camera: Camera) -> U8:
     """An image (h, w, 3) of a camera ``K`` without distortion, as ``camera`` sees it, in its own
     size."""
     h, w = flat.shape[:2]
     small = scaled(camera, (w, h))
     v, u = np.mgrid[:h, :w].astype(np.float64)
-    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-    ways = cv2.undistortPoints(pixels[:, None], small.K, small.distortion)[:, 0]
-    at = project(K, np.column_stack([ways, np.ones(len(ways))])).astype(np.float32)
-    x, y = at.T.reshape(2, h, w)
+    ways = rays(small.K, without_distortion(small, np.column_stack([u.ravel(), v.ravel()])))
+    x, y = project(K, ways).T.reshape(2, h, w).astype(np.float32)
     return np.asarray(cv2.remap(flat, x, y, cv2.INTER_LINEAR), np.uint8)
-
-
-def _enu(point: SurveyPoint, frame: LocalFrame) -> F64:
-    alt = frame.alt_amsl_m if point.alt_amsl_m is None else point.alt_amsl_m
-    return np.asarray(frame.to_enu(np.array([[point.lat_deg, point.lon_deg, alt]]))[0])
 
 
 def _usual_offset(candidates: Sequence[Candidate], to_survey: Similarity) -> F64:

@@ -41,9 +41,10 @@ from service.cameras.images import open_images
 from service.cameras.lens import SIGMA_K1
 from service.cameras.video import open_file
 from service.errors import InputError
+from service.offline.exports.images import frames_near
 
 FILE = "camera.refined.yaml"
-WITHIN_S = 0.02
+WITHIN_NS = 20_000_000
 """An image belongs to a keyframe when their times differ by no more."""
 
 REACH = 3
@@ -82,23 +83,14 @@ def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[
 
     ``video`` is a recording or a folder of stills.
     """
-    wanted = np.array(times_ns, np.int64)
-    within_ns = round(WITHIN_S * 1e9)
-    last_ns = wanted.max(initial=0) + within_ns
     found: dict[int, U8] = {}
-    opened = open_images if video.is_dir() else open_file
-    with closing(opened(str(video), {})) as source:
-        source.only_near((wanted - start_unix_ns).tolist(), within_ns)
-        for frame in source:
-            if start_unix_ns + frame.time_ns > last_ns:
-                break
-            apart = np.abs(wanted - (start_unix_ns + frame.time_ns))
-            k = int(np.argmin(apart))
-            if apart[k] <= within_ns and k not in found:
-                found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
-    if len(found) < max(MIN_IMAGES, MIN_SHARE * len(wanted)):
+    source = (open_images if video.is_dir() else open_file)(str(video), {})
+    for k, image in frames_near(source, [t - start_unix_ns for t in times_ns], WITHIN_NS):
+        if k not in found:
+            found[k] = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    if len(found) < max(MIN_IMAGES, MIN_SHARE * len(times_ns)):
         raise InputError(
-            f"{video}: holds images of {len(found)} of {len(wanted)} keyframes; give the video "
+            f"{video}: holds images of {len(found)} of {len(times_ns)} keyframes; give the video "
             "that the scan was made of"
         )
     return found

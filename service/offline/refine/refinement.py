@@ -59,14 +59,14 @@ from service.offline.refine.control_points import (
 )
 from service.offline.refine.refinement_figures import figures_of, in_words, off_by
 from service.offline.refine.revisions import Revisions, copy_store, grown, moved_frames
-from service.offline.refine.stored_loops import StoredLoops, loose
+from service.offline.refine.stored_loops import loose, stored_loops
 from service.offline.refine.survey_file import SurveyPoint, at_times, read_survey
 from service.progress import Progress
 from service.scans.folder import write_deliverables
 from service.scans.track import camera_of, local_frame
 from service.scans.trust import BY_SURVEY
 from service.scans.writing import check_writable, filling_folder
-from service.stream.records import Repose, ScanHeader, unpack_covariance, unpack_motion
+from service.stream.records import ScanHeader, unpack_covariance, unpack_motion
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -119,9 +119,8 @@ def undo(folder: Path) -> dict[str, Any]:
         revisions = Revisions(store)
         if not revisions.refined:
             raise InputError(f"{folder} was never refined; there is nothing to undo")
-        states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
-        back = [Repose(s.seq, 0, s.T_world_camera, s.scale, s.covariance) for s in states]
-        revisions.append(back, revisions.frames(), revisions.header, {"undone": True})
+        states = revisions.states()
+        revisions.append(states.reposes(), revisions.frames(), revisions.header, {"undone": True})
     return _deliver(folder, {"undone": True, "keyframes": len(states)})
 
 
@@ -209,17 +208,19 @@ class _Refinement:
         self.progress = progress or Progress()
         self.header = revisions.header
         self.frame = local_frame(self.header)
-        states = (revisions.keyframe_state(seq) for seq in store.seqs())
-        self.states = sorted((s for s in states if s is not None), key=lambda s: s.time_ns)
+        self.states = revisions.states()
         self.frames = revisions.frames()
-        self.keyframe = revisions.keyframe
         self.notes: list[str] = []
         self.grown = 1.0  # metres of the survey per metre of the flight's own scale
         self.images: ImageNetwork | None = None
 
+    def keyframe(self, k: int) -> Keyframe | None:
+        """The keyframe at place ``k`` of the states."""
+        return self.revisions.keyframe(self.states, k)
+
     def run(self) -> dict[str, Any]:
         survey = self._survey()
-        places_m = np.array([s.T_world_camera[:3, 3] for s in self.states])
+        places_m = self.states.poses[:, :3, 3]
         if self.options.video is not None:
             with self.progress.part("matching the images again", MATCHING):
                 self._match_again(self.options.video, survey)
@@ -227,7 +228,7 @@ class _Refinement:
         candidates = candidates_of(survey, images, str(self.options.gcp))
         if self.images is not None:
             for one in candidates:
-                crossing_marks(one, images.poses)
+                crossing_marks(one, images.states.poses)
         if self.frame is None and candidates:
             self._place(candidates)
         if self.frame is not None:
@@ -244,7 +245,7 @@ class _Refinement:
             found = self._adjusted(track, candidates)
         warning = clustered(candidates, track.poses[:, :3, 3])
         self.notes += [warning] if warning else []
-        seqs = [s.seq for s in self.states]
+        seqs = self.states.seqs
         if self.images is None or self.grown != 1.0:
             places_m = track.poses[:, :3, 3]
         figures = figures_of(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
@@ -259,7 +260,11 @@ class _Refinement:
         header = replace(self.header, notes=(*self.header.notes, in_words(figures)))
         frames = moved_frames(self.frames, self.states, found, self.frame)
         self.progress.commit("writing the files of the scan")
-        changed = self.revisions.append(self._reposes(found), frames, header, figures)
+        scales = self.states.scales * found.scales
+        after = replace(
+            self.states, poses=found.poses, covariances=found.covariances, scales=scales
+        )
+        changed = self.revisions.append(after.reposes(), frames, header, figures)
         return figures | {"changed": changed}
 
     def own_camera(
@@ -267,7 +272,7 @@ class _Refinement:
     ) -> tuple[SelfCalibrated, Camera]:
         """The camera by the flight's own images, and the one that it was flown with."""
         track, given = self._track(), camera_of(self.header)
-        times = [s.time_ns for s in self.states]
+        times = self.states.times_ns.tolist()
         self.progress("reading the images of the keyframes")
         images = own_camera.images_at(video, self.header.started_unix_ns, times)
         self.progress(f"matching {len(images)} images, and fitting the camera")
@@ -302,7 +307,7 @@ class _Refinement:
                     "or add keyframe_seq, u_px and v_px"
                 )
         seen = [f.time_unix_ns for f in self.frames if "vision" in f.sources]
-        placed = {_ms(t) for t in [*seen, *(s.time_ns for s in self.states)]}
+        placed = {_ms(t) for t in [*seen, *self.states.times_ns.tolist()]}
         lost = {
             mark.image
             for point in survey
@@ -346,13 +351,12 @@ class _Refinement:
             self.notes.append("no control point has a height: heights count from the scan's own 0")
         self.grown = scale = move.scale
         spread = np.diag([0.03**2] * 3 + [1.0] * 3)
-        self.states = [
-            replace(
-                s, T_world_camera=move.pose(s.T_world_camera), covariance=spread,
-                scale=s.scale * scale,
-            )
-            for s in self.states
-        ]  # fmt: skip
+        self.states = replace(
+            self.states,
+            poses=move.pose(self.states.poses),
+            covariances=np.tile(spread, (len(self.states), 1, 1)),
+            scales=self.states.scales * scale,
+        )
         for one in candidates:
             if one.before_m is not None:
                 one.before_m = move.points(one.before_m)
@@ -388,10 +392,8 @@ class _Refinement:
             )
 
     def _track(self) -> KeyframeTrack:
-        times = np.array([s.time_ns * 1e-9 for s in self.states])
-        poses = np.array([s.T_world_camera for s in self.states])
-        spread = np.array([s.covariance for s in self.states])
-        return KeyframeTrack(poses, times - times[0], spread, self._priors())
+        times, states = self.states.times_ns * 1e-9, self.states
+        return KeyframeTrack(states.poses, times - times[0], states.covariances, self._priors())
 
     def _priors(self) -> list[PosePrior]:
         """The flight's telemetry at each keyframe; empty without a log."""
@@ -408,13 +410,13 @@ class _Refinement:
                 return []
             raise InputError(str(error)) from error
         rig = _rig(self.header, self.frame)
-        states = [history.state_at(s.time_ns) for s in self.states]
+        times = self.states.times_ns.tolist()
+        states = [history.state_at(time_ns) for time_ns in times]
         if not any(s is not None and s.lat_deg is not None for s in states):
             self.notes.append(f"{path.name} gives no position of any keyframe: not used")
             return []
         priors = [PosePrior() if s is None else rig.prior(s, None) for s in states]
-        span_s = (self.states[-1].time_ns - self.states[0].time_ns) * 1e-9
-        known = constants([([s.T_world_camera for s in self.states], priors)], span_s)
+        known = constants([(list(self.states.poses), priors)], (times[-1] - times[0]) * 1e-9)
         return [known.applied(prior) for prior in priors]
 
     # ---- loops -------------------------------------------------------------------------------
@@ -422,7 +424,7 @@ class _Refinement:
     def _flown_loops(self) -> list[Loop]:
         """The loops that the flight accepted, with whole images at hand."""
         graph = (self.store.summary or {}).get("graph") or {}
-        at = {s.seq: k for k, s in enumerate(self.states)}
+        at = {seq: k for k, seq in enumerate(self.states.seqs)}
         out = []
         for a, b, motion, upper in (graph.get("loops") or {}).get("motions", []):
             T = unpack_motion(motion)
@@ -437,17 +439,17 @@ class _Refinement:
         """All pairs of keyframes far apart in time that see the same place, verified."""
 
         def at(k: int) -> Keyframe | None:
-            found = self.keyframe(self.states[k])
+            found = self.keyframe(k)
             if found is None:
                 return None
             return replace(found, depth=replace(found.depth, T_world_camera=track.poses[k]))
 
-        return StoredLoops(track, at).find(self.progress)
+        return stored_loops(track, at, self.progress)
 
     def _ahead_m(self) -> float:
         """Usual distance of the ground; 0 without any surface."""
-        few = self.states[:: max(1, len(self.states) // 16)]
-        some = run_parallel(*(partial(self.keyframe, s) for s in few))
+        few = range(0, len(self.states), max(1, len(self.states) // 16))
+        some = run_parallel(*(partial(self.keyframe, k) for k in few))
         depths = [one.depth.depth_m for one in some if one is not None]
         known = [float(np.nanmedian(z)) for z in depths if np.isfinite(z).any()]
         return float(np.median(known)) if known else 0.0
@@ -470,11 +472,14 @@ class _Refinement:
             used = [c for c in candidates if c.is_control]
             marks = [m for c in used for m in c.marks]
             try:
-                found = self._solved(track, points, marks, candidates)
+                found, images = self._solved(track, points, marks)
             except RuntimeError as error:  # so the solver says that the system is ill-posed
                 raise InputError(
                     "the poses of this scan contradict each other too much to be adjusted"
                 ) from error
+            for one in candidates:
+                one.marks = self._carried(one, images)
+            self.images = images
             worst, by = None, 1.0
             for one in used:
                 after = map_position(found.poses, found.scales, one.marks)
@@ -490,16 +495,18 @@ class _Refinement:
             worst.why_not = f"stays {far:.2f} m off after the adjustment"
 
     def _solved(
-        self, track: KeyframeTrack, points: Sequence[ControlPoint], marks: Sequence[Mark],
-        candidates: Sequence[Candidate],
-    ) -> Adjusted:  # fmt: skip
+        self, track: KeyframeTrack, points: Sequence[ControlPoint], marks: Sequence[Mark]
+    ) -> tuple[Adjusted, ImageNetwork | None]:
+        """The adjustment, and where images are matched again their network after it."""
         if self.images is None:
-            return adjust(track, points, marks, self._sigma_scale())
-        before = self.images
-        found, self.images = adjusted(before, track, points, marks, self.states, self.keyframe)
-        for one in candidates:
-            one.marks = carried_marks(one, before, self.images)
-        return found
+            return adjust(track, points, marks, self._sigma_scale()), None
+        return adjusted(self.images, track, points, marks, self.keyframe)
+
+    def _carried(self, one: Candidate, after: ImageNetwork | None) -> list[Mark]:
+        """A point's marks, which move with the images."""
+        if self.images is None or after is None:
+            return one.marks
+        return carried_marks(one, self.images, after)
 
     def _left_out(
         self, track: KeyframeTrack, candidates: Sequence[Candidate]
@@ -515,25 +522,11 @@ class _Refinement:
         out: dict[str, list[float | None] | None] = {}
         for one in used:
             marks = [m for c in used if c is not one for m in c.marks]
-            mine = one.marks
-            if self.images is None:
-                found = adjust(track, points, marks, self._sigma_scale())
-            else:
-                args = track, points, marks, self.states, self.keyframe
-                found, after = adjusted(self.images, *args)
-                mine = carried_marks(one, self.images, after)
-            place = map_position(found.poses, found.scales, mine)
+            found, images = self._solved(track, points, marks)
+            place = map_position(found.poses, found.scales, self._carried(one, images))
             if place is not None:
                 out[one.point.name] = off_by(one, place[0])
         return out
-
-    def _reposes(self, found: Adjusted) -> list[Repose]:
-        return [
-            Repose(s.seq, 0, T, s.scale * float(scale), spread)
-            for s, T, scale, spread in zip(
-                self.states, found.poses, found.scales, found.covariances, strict=True
-            )
-        ]
 
 
 def _points(candidates: Sequence[Candidate]) -> list[ControlPoint]:

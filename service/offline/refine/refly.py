@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -18,7 +17,7 @@ import numpy as np
 
 from recon.surface.raster import Grid
 from recon.table import Rows
-from recon.types import F64, Array, Bool
+from recon.types import F64, Bool
 from service.errors import InputError
 from service.georeference import Feature, LocalFrame, geojson_of
 from service.scans.coverage import Coverage
@@ -35,18 +34,6 @@ NO_FLIGHT = f"no weak place is larger than {SMALLEST_SHARE:.1%} of an image; no 
 
 FORWARD_OVERLAP = 0.8
 """Overlap of consecutive photographs."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Line:
-    """One straight line of the camera over the ground, ENU metres."""
-
-    start_m: F64  # (2,)
-    end_m: F64  # (2,)
-
-    @property
-    def length_m(self) -> float:
-        return float(np.linalg.norm(self.end_m - self.start_m))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +61,7 @@ class MissionItem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refly:
-    lines: tuple[Line, ...]
+    lines: F64  # (L, 2, 2) starts and ends of the camera's lines over the ground, ENU metres
     items: tuple[MissionItem, ...]
     home: tuple[float, float, float]  # latitude, longitude, AMSL metres
     swath: Swath
@@ -84,8 +71,18 @@ class Refly:
 
     @property
     def length_m(self) -> float:
-        ways = sum(float(np.linalg.norm(b.start_m - a.end_m)) for a, b in pairwise(self.lines))
-        return sum(line.length_m for line in self.lines) + ways
+        return _length_m(self.lines.reshape(-1, 2))
+
+
+def _length_m(places: F64) -> float:
+    """Of the way along (N, 2) places."""
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def _directions(lines: F64) -> F64:
+    """(L, 2) unit vectors along (L, 2, 2) lines."""
+    ways = lines[:, 1] - lines[:, 0]
+    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6))
 
 
 def flown_swath(places: Rows, frame: LocalFrame, speed_m_s: float, height_m: float | None) -> Swath:
@@ -151,64 +148,55 @@ def weak_patches(weak: Bool, grid: Grid, swath: Swath) -> list[F64]:
     return out
 
 
-def lines_over(cells_m: F64, swath: Swath, overlap: float) -> list[Line]:
-    """Parallel lines that cover (N, 2) cells, in the direction that takes the shortest way."""
+def lines_over(cells_m: F64, swath: Swath, overlap: float) -> F64:
+    """(L, 2, 2) parallel lines that cover (N, 2) cells, in the direction of the shortest way."""
     box = cv2.minAreaRect(cells_m.astype(np.float32))
     turn = np.radians(box[2])
-    best: list[Line] = []
-    least = np.inf
+    best, least = np.zeros((0, 2, 2)), np.inf
     for angle in (swath.heading_rad, turn, turn + np.pi / 2):
         lines = _parallel(cells_m, angle, swath, overlap)
-        length = sum(line.length_m for line in lines) + swath.across_m * len(lines)
+        length = sum(map(_length_m, lines)) + swath.across_m * len(lines)
         if length < 0.8 * least:  # the heading flown is preferred where little is lost
             best, least = lines, length
     return best
 
 
-def _parallel(cells_m: F64, angle: float, swath: Swath, overlap: float) -> list[Line]:
-    """Lines at ``angle`` (from east to north), back and forth."""
+def _parallel(cells_m: F64, angle: float, swath: Swath, overlap: float) -> F64:
+    """(L, 2, 2) lines at ``angle`` (from east to north), back and forth."""
     way = np.array([np.cos(angle), np.sin(angle)])
     side = np.array([-way[1], way[0]])
     s, t = cells_m @ way, cells_m @ side
     low, width = float(t.min()), float(np.ptp(t))
-    spacing = swath.across_m * (1.0 - overlap)
-    count = max(1, int(np.ceil(width / spacing)))
+    count = max(1, int(np.ceil(width / (swath.across_m * (1.0 - overlap)))))
     step = width / count
-    lines: list[Line] = []
-    for k in range(count):
-        here = np.abs(t - (low + (k + 0.5) * step)) <= 0.5 * step + 1e-6
-        if not here.any():
-            continue
-        # Half an image before and after, so that the ends are seen as often as the middle.
-        first, last = s[here].min() - 0.5 * swath.along_m, s[here].max() + 0.5 * swath.along_m
-        middle = (low + (k + 0.5) * step) * side
-        ends = [first * way + middle, last * way + middle]
-        if len(lines) % 2:
-            ends.reverse()
-        lines.append(Line(ends[0], ends[1]))
-    return lines
+    lines: list[F64] = []
+    for middle in low + (np.arange(count) + 0.5) * step:
+        here = s[np.abs(t - middle) <= 0.5 * step + 1e-6]
+        if len(here):
+            # Half an image before and after, so that the ends are seen as often as the middle.
+            ends = np.array([here.min() - 0.5 * swath.along_m, here.max() + 0.5 * swath.along_m])
+            line = ends[:, None] * way + middle * side
+            lines.append(line[::-1] if len(lines) % 2 else line)
+    return np.array(lines)
 
 
-def in_order(groups: Sequence[Sequence[Line]], begin_m: F64) -> list[Line]:
-    """All groups' lines, the nearest next, each group entered at its nearer end."""
-    left = [list(group) for group in groups if group]
-    out: list[Line] = []
+def in_order(groups: Sequence[F64], begin_m: F64) -> F64:
+    """(L, 2, 2) all groups' lines, the nearest next, each group entered at its nearer end."""
+    left = list(groups)
+    out: list[F64] = []
     here = begin_m
     while left:
-        choices = [(_entries(group), group) for group in left]
-        ways = [(float(np.linalg.norm(e[0].start_m - here)), k, e)
-                for k, (entries, _) in enumerate(choices) for e in entries]  # fmt: skip
-        _, k, nearest = min(ways, key=lambda w: w[:2])
+        # A group is flown from its first or last line, from either end.
+        choices = [
+            (float(np.linalg.norm(entry[0, 0] - here)), k, entry)
+            for k, group in enumerate(left)
+            for entry in (group, group[:, ::-1], group[::-1], group[::-1, ::-1])
+        ]
+        _, k, nearest = min(choices, key=lambda choice: choice[:2])
         left.pop(k)
-        out += nearest
-        here = nearest[-1].end_m
-    return out
-
-
-def _entries(group: list[Line]) -> list[list[Line]]:
-    """The four ways to fly a group: from its first or last line, from either end."""
-    swapped = [Line(line.end_m, line.start_m) for line in group]
-    return [group, swapped, group[::-1], swapped[::-1]]
+        out.append(nearest)
+        here = nearest[-1, 1]
+    return np.concatenate(out)
 
 
 def suggest_as_flown(
@@ -260,43 +248,33 @@ def suggest(
             f"{count} lines would be needed, more than {MAX_LINES}; raise --sigma-m, lower "
             "--views or fly the whole area again"
         )
-    begin = coverage.places["camera_m"][-1, :2]
-    lines = [_behind(line, swath) for line in in_order(groups, begin)]
-    home = _first_place(coverage, frame, height_m)
-    items = _items(lines, frame, swath, relative, photos)
-    area = sum(map(len, patches)) * coverage.layer.grid.cell_m**2
+    cameras, grid = coverage.places["camera_m"], coverage.layer.grid
+    lines = in_order(groups, cameras[-1, :2])
+    lines = lines - swath.ahead_m * _directions(lines)[:, None]  # the image's middle follows them
+    lat, lon, alt = frame.to_geodetic(cameras[:1])[0].tolist()
     return Refly(
-        tuple(lines), tuple(items), home, swath, swath.across_m * (1 - overlap), area, len(patches)
+        lines,
+        tuple(_items(lines, frame, swath, relative, photos)),
+        (lat, lon, alt - (height_m or 0.0)),
+        swath,
+        swath.across_m * (1 - overlap),
+        sum(map(len, patches)) * grid.cell_m**2,
+        len(patches),
     )
 
 
-def _behind(line: Line, swath: Swath) -> Line:
-    """Where to fly so that the image's middle follows ``line``."""
-    way = (line.end_m - line.start_m) / max(line.length_m, 1e-6)
-    return Line(line.start_m - swath.ahead_m * way, line.end_m - swath.ahead_m * way)
-
-
-def _first_place(
-    coverage: Coverage, frame: LocalFrame, height_m: float | None
-) -> tuple[float, float, float]:
-    camera = coverage.places["camera_m"][0]
-    lat, lon, alt = frame.to_geodetic(camera[None])[0]
-    return float(lat), float(lon), float(alt) - (height_m or 0.0)
-
-
 def _items(
-    lines: Sequence[Line], frame: LocalFrame, swath: Swath, relative: bool, photos: bool
+    lines: F64, frame: LocalFrame, swath: Swath, relative: bool, photos: bool
 ) -> list[MissionItem]:
     """Take-off, speed, camera on, all lines, camera off, return."""
     where = RELATIVE if relative else AMSL
     altitude = (swath.height_m or 0.0) if relative else swath.altitude_amsl_m
     altitude = round(altitude, 2)
-    ends = np.array([end for line in lines for end in (line.start_m, line.end_m)])
-    places = frame.to_geodetic(np.column_stack([ends, np.zeros(len(ends))]))
-    points = [(round(float(p[0]), 8), round(float(p[1]), 8)) for p in places]
+    points = _lon_lat(lines.reshape(-1, 2), frame)
 
-    def at(command: int, point: tuple[float, float]) -> MissionItem:
-        return MissionItem(command, where, (0.0, 0.0, 0.0, 0.0), *point, altitude)
+    def at(command: int, lon_lat: list[float]) -> MissionItem:
+        lon, lat = lon_lat
+        return MissionItem(command, where, (0.0, 0.0, 0.0, 0.0), lat, lon, altitude)
 
     speed = max(swath.speed_m_s, 1.0)
     interval = max(round((1 - FORWARD_OVERLAP) * swath.along_m / speed, 1), 0.5)
@@ -317,35 +295,31 @@ def _items(
 
 def geojson(refly: Refly | None, frame: LocalFrame) -> str:
     """Each line, and the ground that its images cover, as GeoJSON; no features without a flight."""
+    if refly is None:
+        return geojson_of([])
     features: list[Feature] = []
-    for number, line in enumerate(refly.lines if refly else (), 1):
-        assert refly is not None
-        swath = refly.swath
-        way = (line.end_m - line.start_m) / max(line.length_m, 1e-6)
+    swath, ways = refly.swath, _directions(refly.lines)
+    for number, (line, way) in enumerate(zip(refly.lines, ways, strict=True), 1):
         aside = 0.5 * swath.across_m * np.array([-way[1], way[0]])
-        before, after = ((swath.ahead_m + k * swath.along_m) * way for k in (-0.5, 0.5))
-        ring = [line.start_m + before - aside, line.end_m + after - aside,
-                line.end_m + after + aside, line.start_m + before + aside]  # fmt: skip
-        route = _lon_lat([line.start_m, line.end_m], frame)
-        for geometry in (
-            {"type": "Polygon", "coordinates": [_lon_lat([*ring, ring[0]], frame)]},
-            {"type": "LineString", "coordinates": route},
-        ):
-            facts = {"line": number, "altitude_amsl_m": round(swath.altitude_amsl_m, 1)}
-            features.append((facts, geometry))
+        ends = [swath.ahead_m - 0.5 * swath.along_m, swath.ahead_m + 0.5 * swath.along_m]
+        before, after = line + np.array(ends)[:, None] * way
+        ring = [before - aside, after - aside, after + aside, before + aside, before - aside]
+        facts = {"line": number, "altitude_amsl_m": round(swath.altitude_amsl_m, 1)}
+        ground = {"type": "Polygon", "coordinates": [_lon_lat(np.array(ring), frame)]}
+        route = {"type": "LineString", "coordinates": _lon_lat(line, frame)}
+        features += [(facts, ground), (facts, route)]
     return geojson_of(features)
 
 
-def _lon_lat(places_m: Sequence[F64], frame: LocalFrame) -> list[list[float]]:
+def _lon_lat(places_m: F64, frame: LocalFrame) -> list[list[float]]:
     rows = frame.to_geodetic(np.column_stack([places_m, np.zeros(len(places_m))]))
-    return [[round(float(r[1]), 8), round(float(r[0]), 8)] for r in rows]
+    return [[round(lon, 8), round(lat, 8)] for lat, lon, _ in rows.tolist()]
 
 
 def plan_json(refly: Refly) -> str:
     """The mission as QGroundControl's .plan."""
     items: list[dict[str, Any]] = []
     for n, item in enumerate(refly.items, 1):
-        placed = item.frame != MISSION
         entry: dict[str, Any] = {
             "type": "SimpleItem",
             "autoContinue": True,
@@ -354,7 +328,7 @@ def plan_json(refly: Refly) -> str:
             "frame": item.frame,
             "params": [*item.params, item.lat_deg, item.lon_deg, item.alt_m],
         }
-        if placed:
+        if item.frame != MISSION:
             mode = 1 if item.frame == RELATIVE else 2
             entry |= {"AMSLAltAboveTerrain": None, "Altitude": item.alt_m, "AltitudeMode": mode}
         items.append(entry)
@@ -380,7 +354,7 @@ def plan_json(refly: Refly) -> str:
 
 def waypoints_text(refly: Refly) -> str:
     """The mission as QGC WPL 110, which Mission Planner and MAVProxy read; home comes first."""
-    rows: list[Array | tuple[Any, ...]] = [(0, 1, 0, WAYPOINT, 0, 0, 0, 0, *refly.home, 1)]
+    rows: list[tuple[float, ...]] = [(0, 1, 0, WAYPOINT, 0, 0, 0, 0, *refly.home, 1)]
     for n, i in enumerate(refly.items, 1):
         rows.append((n, 0, i.frame, i.command, *i.params, i.lat_deg, i.lon_deg, i.alt_m, 1))
     return "QGC WPL 110\n" + "".join("\t".join(_number(v) for v in row) + "\n" for row in rows)

@@ -20,7 +20,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.ground_control import Adjusted
-from recon.types import F64, DepthMap, Keyframe
+from recon.types import F64, I64, DepthMap, Keyframe
 from service.cameras.rig import attitude_of
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
@@ -56,14 +56,21 @@ class _Note(msgspec.Struct):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KeyframeState:
-    """Where a keyframe is, or was before any refinement."""
+class KeyframeStates:
+    """Where keyframes are, or were before any refinement, in order of time."""
 
-    seq: int
-    time_ns: int
-    T_world_camera: F64  # (4, 4)
-    covariance: F64  # (6, 6)
-    scale: float  # that the flight gave its coded depth
+    seqs: list[int]
+    times_ns: I64  # (N,)
+    poses: F64  # (N, 4, 4) T_world_camera
+    covariances: F64  # (N, 6, 6)
+    scales: F64  # (N,) that the flight gave their coded depth
+
+    def __len__(self) -> int:
+        return len(self.seqs)
+
+    def reposes(self) -> list[Repose]:
+        rows = zip(self.seqs, self.poses, self.scales.tolist(), self.covariances, strict=True)
+        return [Repose(seq, 0, T, scale, spread) for seq, T, scale, spread in rows]
 
 
 class Revisions:
@@ -89,10 +96,21 @@ class Revisions:
         found = None if text is None else header_from_json(text.encode())
         return found or self._store.header
 
-    def keyframe_state(self, seq: int, below: int = REFINED) -> KeyframeState | None:
-        """The state of a keyframe by revisions ``below``, the unrefined one; None when nothing of
-        it can be read.
-        """
+    def states(self, below: int = REFINED) -> KeyframeStates:
+        """The keyframes that can be read, by revisions ``below``: the unrefined ones."""
+        found = [s for seq in self._store.seqs() if (s := self._state(seq, below)) is not None]
+        found.sort(key=lambda s: s[0])
+        rows = [row for _, row in found]
+        return KeyframeStates(
+            [row.seq for row in rows],
+            np.array([time_ns for time_ns, _ in found], np.int64),
+            np.array([row.T_world_camera for row in rows]).reshape(-1, 4, 4),
+            np.array([row.covariance for row in rows]).reshape(-1, 6, 6),
+            np.array([row.scale for row in rows]),
+        )
+
+    def _state(self, seq: int, below: int) -> tuple[int, Repose] | None:
+        """Time and pose of a keyframe; None when nothing of it can be read."""
         data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
         base = self._store.repose(seq, below=below)
         if data is None:
@@ -107,19 +125,17 @@ class Revisions:
                 return None
             head, _ = unpacked
             time_ns, T, covariance = head.time_unix_ns, head.T_world_camera, head.covariance
-        if base is not None:
-            return KeyframeState(seq, time_ns, base.T_world_camera, base.covariance, base.scale)
-        return KeyframeState(seq, time_ns, T, covariance, 1.0)
+        return time_ns, base or Repose(seq, 0, T, 1.0, covariance)
 
-    def keyframe(self, state: KeyframeState) -> Keyframe | None:
-        """A keyframe with its depth as it was before any refinement."""
-        found = self._store.keyframe(state.seq)
+    def keyframe(self, states: KeyframeStates, k: int) -> Keyframe | None:
+        """The keyframe at place ``k`` with its depth in that state."""
+        found = self._store.keyframe(states.seqs[k])
         if found is None:
             return None
-        now = self._store.repose(state.seq)
-        grown = np.float32(state.scale / (1.0 if now is None else now.scale))
+        now = self._store.repose(found.seq)
+        grown = np.float32(states.scales[k] / (1.0 if now is None else now.scale))
         d = found.depth
-        depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, state.T_world_camera)
+        depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, states.poses[k])
         return Keyframe(found.seq, found.time_ns, depth, found.bgr, found.pose, found.fresh)
 
     def frames(self) -> list[PoseRecord]:
@@ -215,18 +231,18 @@ def grown(T: F64, scale: float) -> F64:
 
 def moved_frames(
     frames: Sequence[PoseRecord],
-    states: Sequence[KeyframeState],
+    states: KeyframeStates,
     found: Adjusted,
     place: LocalFrame | None,
 ) -> list[PoseRecord]:
     """Every frame's pose, carried by the keyframes before and after it."""
-    keys = np.array([s.time_ns for s in states])
+    keys = states.times_ns
     out: list[PoseRecord] = []
     before: PoseRecord | None = None
     distance = 0.0
     for frame in frames:
         b = int(np.clip(np.searchsorted(keys, frame.time_unix_ns), 1, len(keys) - 1))
-        one, two = (_carried(frame, states[k], found, k) for k in (b - 1, b))
+        one, two = (_carried(frame, states.poses[k], found, k) for k in (b - 1, b))
         share = (frame.time_unix_ns - keys[b - 1]) / max(int(keys[b] - keys[b - 1]), 1)
         share = float(np.clip(share, 0.0, 1.0))
         T = one @ se3.exp(share * se3.log(se3.inverse(one) @ two))
@@ -244,9 +260,9 @@ def moved_frames(
     return out
 
 
-def _carried(frame: PoseRecord, state: KeyframeState, found: Adjusted, k: int) -> F64:
+def _carried(frame: PoseRecord, T_key: F64, found: Adjusted, k: int) -> F64:
     """A frame's pose as one keyframe carries it along."""
-    relative = se3.inverse(state.T_world_camera) @ frame.T_world_camera
+    relative = se3.inverse(T_key) @ frame.T_world_camera
     return np.asarray(found.poses[k] @ grown(relative, float(found.scales[k])))
 
 

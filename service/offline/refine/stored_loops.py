@@ -96,68 +96,48 @@ def verified(
     return Loop(a, b, T_a_b, loose(T_a_b, covariance), growth)
 
 
-class StoredLoops:
-    """Finds loops; keyframes are numbered by their place on the track."""
+def stored_loops(
+    track: KeyframeTrack,
+    keyframe: Callable[[int], Keyframe | None],
+    progress: Progress | None = None,
+    scans: Sequence[int] | None = None,
+    min_gap: int = MIN_GAP,
+) -> list[Loop]:
+    """All pairs of keyframes far apart in time that see the same place, verified; by their places
+    on the track.
 
-    def __init__(
-        self,
-        track: KeyframeTrack,
-        keyframe: Callable[[int], Keyframe | None],
-        scans: Sequence[int] | None = None,
-        min_gap: int = MIN_GAP,
-    ) -> None:
-        """``keyframe`` gives each one with its depth at its pose on the track.
+    ``keyframe`` gives each one with its depth at its pose on the track. With ``scans``, the number
+    of each keyframe's scan, only loops between scans are sought.
+    """
+    pauses = np.diff(track.times_s, prepend=track.times_s[0])
+    ends = LoopEnds(keyframe, np.cumsum(pauses > BREAK_S).tolist())
+    tree = cKDTree(track.poses[:, :2, 3])
 
-        With ``scans``, the number of each keyframe's scan, only loops between scans are sought.
-        """
-        self._track, self._min_gap = track, min_gap
-        self._scans = scans
-        pauses = np.diff(track.times_s, prepend=track.times_s[0])
-        self._ends = LoopEnds(keyframe, np.cumsum(pauses > BREAK_S).tolist())
+    def verified_at(a: int, b: int) -> Loop | None:
+        reach = NEIGHBOURS  # to fill each of two views with, so that they share none
+        if ends.stretches[a] == ends.stretches[b]:
+            reach = next((n for n in (NEIGHBOURS, NEIGHBOURS // 2, 2, 1) if 2 * n < b - a), 0)
+        guess = se3.inverse(track.poses[a]) @ track.poses[b]
+        return verified(a, b, (ends.end(a, reach), ends.end(b, reach)), guess)
 
-    def find(self, progress: Progress | None = None) -> list[Loop]:
-        """All pairs far apart in time that see the same place, verified."""
-        tree = cKDTree(self._track.poses[:, :2, 3])
-        out: list[Loop] = []
-        later = range(self._min_gap, len(self._track.poses))
-        for b in (progress or Progress()).over(later, len(later)):
-            for earlier in self._near(b, tree):
-                found = (self._verified(a, b) for a in self._likely(b, earlier))
-                out += islice(filter(None, found), LOOPS_PER_KEYFRAME)
-        return weighted(out)
-
-    def _near(self, b: int, tree: cKDTree) -> list[list[int]]:
-        """Earlier keyframes near ``b``, those of each other scan by themselves."""
-        own = self._ends.at(b)
+    out: list[Loop] = []
+    later = range(min_gap, len(track.poses))
+    for b in (progress or Progress()).over(later, len(later)):
+        own = ends.at(b)
         if own is None:
-            return []
-        near = tree.query_ball_point(self._track.poses[b, :2, 3], reach_m(own))
-        earlier = sorted(a for a in near if a <= b - self._min_gap)
-        if self._scans is None:
-            return [earlier]
-        scans = self._scans
-        others = sorted({scans[a] for a in earlier} - {scans[b]})
-        return [[a for a in earlier if scans[a] == other] for other in others]
-
-    def _likely(self, b: int, earlier: Sequence[int]) -> list[int]:
-        """Those of the ``earlier`` keyframes that see what ``b`` sees, best first."""
-        end = self._ends.end(b) if earlier else None
+            continue
+        groups: dict[int, list[int]] = {}  # earlier keyframes near it, of each scan
+        for a in sorted(tree.query_ball_point(track.poses[b, :2, 3], reach_m(own))):
+            if a <= b - min_gap and (scans is None or scans[a] != scans[b]):
+                groups.setdefault(0 if scans is None else scans[a], []).append(a)
+        end = ends.end(b) if groups else None
         if end is None:
-            return []
-        poses = {a: self._track.poses[a] for a in (*earlier, b)}
-        return likely(end, poses)
-
-    def _verified(self, a: int, b: int) -> Loop | None:
-        reach = self._reach(a, b)
-        ends = self._ends.end(a, reach), self._ends.end(b, reach)
-        guess = se3.inverse(self._track.poses[a]) @ self._track.poses[b]
-        return verified(a, b, ends, guess)
-
-    def _reach(self, a: int, b: int) -> int:
-        """Neighbours to fill each of two views with, so that they share none."""
-        if self._ends.stretches[a] != self._ends.stretches[b]:
-            return NEIGHBOURS
-        return next((n for n in (NEIGHBOURS, NEIGHBOURS // 2, 2, 1) if 2 * n < b - a), 0)
+            continue
+        for _, group in sorted(groups.items()):
+            poses = {a: track.poses[a] for a in (*group, b)}
+            found = (verified_at(a, b) for a in likely(end, poses))
+            out += islice(filter(None, found), LOOPS_PER_KEYFRAME)
+    return weighted(out)
 
 
 def reach_m(one: Keyframe) -> float:

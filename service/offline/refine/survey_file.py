@@ -16,15 +16,18 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
+from recon.types import F64
 from service.errors import InputError
-from service.georeference import degrees_of, is_system, system_of
+from service.georeference import LocalFrame, degrees_of, is_system, system_of
 from service.offline.refine.metashape_file import read_metashape
 from service.small_file import read_small
 
@@ -67,8 +70,8 @@ class SurveyRow(msgspec.Struct, frozen=True):
             )
 
 
-Row = tuple[int, SurveyRow]
-"""Line number and content."""
+Row = tuple[int, Mapping[str, object]]
+"""Line number, and what it has of the fields of SurveyRow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,35 +100,47 @@ class SurveyPoint:
     line: int
     sightings: tuple[Sighting, ...]
 
+    def enu(self, frame: LocalFrame) -> F64:
+        """(3,) m in a frame, at its zero where the height is not known."""
+        alt = frame.alt_amsl_m if self.alt_amsl_m is None else self.alt_amsl_m
+        return np.asarray(frame.to_enu(np.array([[self.lat_deg, self.lon_deg, alt]]))[0])
+
 
 def read_survey(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
     """The points of a file in order of their first row; some may have no marks.
 
     Raises InputError in one line, with the number of the line, for anything that is wrong.
     """
-    points: dict[str, SurveyPoint] = {}
     lines = _lines(path)
-    if marks is not None:
-        return _marked(path, lines, _pix4d_marks(marks), marks)
-    if _is_places(lines):
-        return _marked(path, lines, {}, path)
-    for line, row in _reader(lines)(path, lines):
-        point = _point(line, row)
-        before = points.get(point.name)
-        if before is None:
-            points[point.name] = point
+    if marks is not None or _is_places(lines):
+        return _marked(path, lines, marks)
+    points: dict[str, SurveyPoint] = {}
+    for line, fields in _reader(lines)(path, lines):
+        with _fault_in(f"{path} line {line}"):
+            point = _point(line, fields)
+        before = points.setdefault(point.name, point)
+        if before is point:
             continue
-        if _said(before) != _said(point):
+        if replace(point, line=before.line, sightings=before.sightings) != before:
             raise InputError(
                 f"{path} line {line}: {point.name} differs from line {before.line} in place, "
                 "sigma or role; one name is one point"
             )
-        points[point.name] = SurveyPoint(
-            *_said(before), before.line, before.sightings + point.sightings
-        )
+        points[point.name] = replace(before, sightings=before.sightings + point.sightings)
     if not points:
         raise InputError(f"{path}: no points below the first line")
     return list(points.values())
+
+
+@contextmanager
+def _fault_in(where: str) -> Iterator[None]:
+    """What is wrong, and in which column, as InputError in one line that begins with ``where``."""
+    try:
+        yield
+    except (ValueError, msgspec.ValidationError) as error:
+        text, _, column = str(error).partition(" - at `$")
+        name = column.strip(".`")
+        raise InputError(f"{where}: {f'{name}: ' if name else ''}{text}") from error
 
 
 def _lines(path: Path) -> list[str]:
@@ -157,10 +172,6 @@ def _at_time(seen: Sighting, times_unix_s: Mapping[str, float], path: Path) -> S
     raise InputError(f"{path} line {seen.line}: image {seen.image} {why}")
 
 
-def _said(p: SurveyPoint) -> tuple[str, float, float, float | None, float, float, bool]:
-    return p.name, p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m, p.is_check
-
-
 def _reader(lines: Sequence[str]) -> Callable[[Path, Sequence[str]], Iterator[Row]]:
     if lines and lines[0].lstrip().startswith("<"):
         return _markers
@@ -168,13 +179,9 @@ def _reader(lines: Sequence[str]) -> Callable[[Path, Sequence[str]], Iterator[Ro
 
 
 def _markers(path: Path, lines: Sequence[str]) -> Iterator[Row]:
-    """Line number and content of each mark of Metashape's markers."""
+    """Each mark of Metashape's markers."""
     try:
-        for line, row in read_metashape("\n".join(lines)):
-            try:
-                yield line, msgspec.convert(row, SurveyRow)
-            except msgspec.ValidationError as error:
-                raise ValueError(f"line {line}: {_why(error)}") from error
+        yield from read_metashape("\n".join(lines))
     except ValueError as error:
         raise InputError(f"{path} {error}") from error
 
@@ -194,22 +201,18 @@ def _pix4d_marks(path: Path) -> dict[str, list[Sighting]]:
     return found
 
 
-def _marked(
-    path: Path, lines: Sequence[str], seen: dict[str, list[Sighting]], marks: Path
-) -> list[SurveyPoint]:
+def _marked(path: Path, lines: Sequence[str], marks: Path | None) -> list[SurveyPoint]:
     """The points below the coordinate system in ``lines``, with their sightings in ``marks``."""
+    seen = {} if marks is None else _pix4d_marks(marks)
     (system, unit_m), points = _system(path, lines), dict[str, SurveyPoint]()
     for number, cells in _cells(lines[1:], 2):
         where = f"{path} line {number}"
-        try:
+        with _fault_in(f"{where}: name, x, y, z and accuracies"):
             name, x, y, z, *sigmas = cells
             lon, lat = degrees_of(system, float(x), float(y))
             named = dict(zip(("sigma_h_m", "sigma_v_m"), map(float, sigmas[:2]), strict=False))
             row = {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": unit_m * float(z), **named}
-            point = _point(number, msgspec.convert(row, SurveyRow))
-        except (ValueError, msgspec.ValidationError) as error:
-            said = f"name, x, y, z and accuracies: {_why(error)}"
-            raise InputError(f"{where}: {said}") from error
+            point = _point(number, row)
         name = point.name
         if name in points:
             raise InputError(f"{where}: {name} is also in line {points[name].line}")
@@ -247,17 +250,15 @@ def is_list(lines: Sequence[str]) -> bool:
 
 def _system(path: Path, lines: Sequence[str]) -> tuple[Transformer, float]:
     """The coordinate system in the first line, and the unit of its heights in metres."""
-    try:
+    with _fault_in(f"{path} line 1"):
         system, datum, unit_m = system_of(lines[0] if lines else "")
-    except ValueError as error:
-        raise InputError(f"{path} line 1: {error}") from error
-    if datum == "ellipsoid":
-        raise InputError(f"{path} line 1: heights above mean sea level are needed, not ellipsoidal")
+        if datum == "ellipsoid":
+            raise ValueError("heights above mean sea level are needed, not ellipsoidal")
     return system, unit_m
 
 
 def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
-    """Line number and content of each row of a ``gcp_list.txt``."""
+    """Each row of a ``gcp_list.txt``."""
     system, unit_m = _system(path, lines)
     table = [(n, s.split()) for n, s in enumerate(lines[1:], 2) if s.strip() and s[0] != "#"]
     is_flat = all(
@@ -265,26 +266,21 @@ def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
     )
     names: dict[tuple[str, ...], str] = {}
     for number, cells in table:
-        where = f"{path} line {number}"
-        if len(cells) < LIST_COLUMNS:
-            raise InputError(
-                f"{where}: {len(cells)} columns; x, y, z, u, v and an image are needed"
-            )
-        name = names.setdefault(tuple(cells[:3]), f"point {len(names) + 1}")
-        try:
+        with _fault_in(f"{path} line {number}"):
+            if len(cells) < LIST_COLUMNS:
+                raise ValueError(f"{len(cells)} columns; x, y, z, u, v and an image are needed")
+            name = names.setdefault(tuple(cells[:3]), f"point {len(names) + 1}")
             lon, lat = degrees_of(system, float(cells[0]), float(cells[1]))
             row = {
                 "name": cells[6] if len(cells) > LIST_COLUMNS else name, "lat": lat, "lon": lon,
                 "alt_amsl_m": None if is_flat else unit_m * float(cells[2]),
                 "u_px": float(cells[3]), "v_px": float(cells[4]), "image": cells[5],
             }  # fmt: skip
-            yield number, msgspec.convert(row, SurveyRow)
-        except (ValueError, msgspec.ValidationError) as error:
-            raise InputError(f"{where}: {_why(error)}") from error
+        yield number, row
 
 
 def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
-    """Line number and content of each row of a CSV."""
+    """Each row of a CSV."""
     table = csv.reader(lines)
     try:
         header = [name.strip() for name in next(table, [])]
@@ -297,24 +293,15 @@ def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
                     f"{path} line {table.line_num}: {len(cells)} cells, but {len(header)} columns; "
                     "decimals take a point, not a comma"
                 )
-            filled = {k: v for k, c in zip(header, cells, strict=False) if (v := c.strip())}
-            yield table.line_num, msgspec.convert(filled, SurveyRow, strict=False)
+            named = zip(header, cells, strict=False)
+            yield table.line_num, {name: v for name, cell in named if (v := cell.strip())}
     except csv.Error as error:
         raise InputError(f"{path} line {table.line_num}: not CSV ({error})") from error
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path} line {table.line_num}: {_why(error)}") from error
 
 
 def _name(text: str) -> str:
     """A point's name on one line, as a file can keep it."""
     return " ".join(text.split())
-
-
-def _why(error: Exception) -> str:
-    """Which column is wrong, and how."""
-    text, _, column = str(error).partition(" - at `$")
-    name = column.strip(".`")
-    return f"{name}: {text}" if name else text
 
 
 def _check_header(path: Path, header: list[str]) -> None:
@@ -326,8 +313,9 @@ def _check_header(path: Path, header: list[str]) -> None:
         )
 
 
-def _point(line: int, row: SurveyRow) -> SurveyPoint:
-    """The point of one row, with its sighting."""
+def _point(line: int, fields: Mapping[str, object]) -> SurveyPoint:
+    """The point of one row, with its sighting. Raises ValidationError."""
+    row = msgspec.convert(fields, SurveyRow, strict=False)
     mark = Sighting(line, row.keyframe_seq, row.time, row.image)
     marks: tuple[Sighting, ...] = ()
     if row.u_px is not None and row.v_px is not None:

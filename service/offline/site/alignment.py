@@ -28,13 +28,12 @@ from recon.similarity import umeyama
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of
-from service.offline.exports.view import ExportOptions, ScanView
-from service.offline.refine.stored_loops import BREAK_S, StoredLoops
+from service.offline.exports.view import USUAL, ExportOptions, ScanView
+from service.offline.refine.stored_loops import BREAK_S, stored_loops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
 from service.offline.site.start import SIGMA_SCALE as START_SCALE
-from service.offline.site.start import StartPoints, start_of
-from service.offline.tiles import TILE_POINTS
+from service.offline.site.start import Pair, start_of
 from service.progress import Progress
 from service.scans.folder import resolution_m, write_deliverables
 from service.scans.fused_cloud import TiledCloud
@@ -77,15 +76,14 @@ class AlignedSite:
 
 def align_site(
     folders: Sequence[Path], out: Path, deliver: bool = True,
-    starts: Mapping[Path, StartPoints] | None = None, progress: Progress | None = None,
-    tile_points: int = TILE_POINTS, scheduler: str | None = None,
+    starts: Mapping[Path, list[Pair]] | None = None, progress: Progress | None = None,
+    options: ExportOptions = USUAL,
 ) -> AlignedSite:  # fmt: skip
     """Gather the scans into the folder ``out``, align them, and write the site's files.
 
     The scans of a site that lies there already come first; its earlier alignments stay listed.
-    ``starts`` place scans without georeference, by their folders; ``tile_points`` and
-    ``scheduler`` are those of an export. Waits while another process
-    aligns this site.
+    ``starts`` place scans without georeference, by their folders; ``options`` are those of the
+    site's cloud. Waits while another process aligns this site.
     Raises InputError for scans that make no site, and when ``out`` holds anything else.
     """
     _known(out)
@@ -93,24 +91,19 @@ def align_site(
     with _locked(out):
         site = _align(folders, out, starts or {}, progress)
         if deliver:
-            write_files(out, tile_points, scheduler, progress)
+            write_files(out, options, progress)
     return site
 
 
 def write_files(
-    folder: Path,
-    tile_points: int = TILE_POINTS,
-    scheduler: str | None = None,
-    progress: Progress | None = None,
+    folder: Path, options: ExportOptions = USUAL, progress: Progress | None = None
 ) -> None:
     """Write the files of the site in ``folder``, the cloud of a large one in tiles.
 
     Errors as of :func:`write_deliverables`.
     """
     with ScanStore.open(folder / "scan.db") as store, ScanView(folder, None, progress) as view:
-        options = ExportOptions(
-            voxel_m=resolution_m(store.header), tile_points=tile_points, scheduler=scheduler
-        )
+        options = replace(options, voxel_m=resolution_m(store.header))
         cut, tiled = view.tiling(options, VOXELS_MARGIN_M), None
         if len(cut.tiles) > 1:
             tiled = TiledCloud(
@@ -140,7 +133,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _align(
-    folders: Sequence[Path], out: Path, starts: Mapping[Path, StartPoints], progress: Progress
+    folders: Sequence[Path], out: Path, starts: Mapping[Path, list[Pair]], progress: Progress
 ) -> AlignedSite:
     known = _known(out)
     earlier = [Path(s["folder"]) for s in known.get("scans", [])]
@@ -210,8 +203,7 @@ def _aligned(
     ties, kept = [], []
     if len(members) > 1:
         with progress.part("seeking ties", 0.9):
-            stored = StoredLoops(track, keyframe, scans, min_gap=1)
-            loops = stored.find(progress)
+            loops = stored_loops(track, keyframe, progress, scans, min_gap=1)
         for loop in supported(loops, track.poses):
             one = keyframe(loop.b)
             assert one is not None
@@ -380,9 +372,9 @@ def _scan(member: Member, found: SiteAlignment, centres_m: F64, k: int) -> dict[
         "started_unix_s": member.header.started_unix_ns / 1e9,
         "keyframes": [member.first, member.last],
         "placed": "aligned" if tied else f"by its {_by(member)}",
-        "start": None if member.start is None else msgspec.to_builtins(member.start.pairs),
-        "T_site_scan": np.round(move.pose(member.T_site_scan), 9).tolist(),
-        "scale": round(member.scale * move.scale, 6),
+        "start": None if member.start is None else msgspec.to_builtins(member.start),
+        "T_site_scan": np.round(move.pose(member.move.pose(np.eye(4))), 9).tolist(),
+        "scale": round(member.move.scale * move.scale, 6),
         "moved_m": [round(float(v), 3) for v in moved],
         "turned_deg": round(float(np.degrees(np.linalg.norm(se3.so3_log(move.R)))), 4),
         "sigma_m": [round(float(v), 3) for v in sigma[3:6]],

@@ -24,17 +24,17 @@ from recon.surface.change import (
     volumes,
 )
 from recon.surface.ground import ground_cells
-from recon.surface.raster import Grid, Raster, grid_over
+from recon.surface.raster import Grid, Raster
 from recon.types import F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
-from service.offline.exports.view import ExportOptions, ScanView
+from service.offline.exports.view import USUAL, ExportOptions, ScanView
 from service.offline.geopackage import polygons, write_layers
 from service.offline.site.alignment import AlignedSite, align_site, write_files
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
 from service.offline.site.gather import Member
-from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles
+from service.offline.tiles import Tile, grown, run_tiles
 from service.progress import Progress
 from service.scans.fused_cloud import fused_cloud, placed
 from service.scans.main_piece import Piece
@@ -92,9 +92,7 @@ def compare(
     before: Path,
     after: Path,
     out: Path,
-    cell_m: float | None = None,
-    tile_points: int = TILE_POINTS,
-    scheduler: str | None = None,
+    options: ExportOptions = USUAL,
     bare: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -108,13 +106,12 @@ def compare(
     with progress.part("aligning", 0.4):
         site = align_site([before, after], out, deliver=False, progress=progress)
     one, two = _pair(site, before, after)
-    pair = site.members[one], site.members[two]
-    with ScanView(out) as view:
+    with ScanView(out, None, progress) as view:
         view.needs_place("a comparison")
-        parts = ((pair[0].first, pair[0].last), (pair[1].first, pair[1].last))
+        first, last = ((m.first, m.last) for m in (site.members[one], site.members[two]))
         apart = _apart_m(site, one, two)
         with progress.part("comparing the surfaces", 0.7):
-            found = changes(view, out, parts, apart, cell_m, tile_points, scheduler, progress, bare)
+            found = changes(view, out, (first, last), apart, options, bare)
         if found is None:
             raise InputError(f"{before} and {after} share no ground")
         document = _document(site, found, one, two)
@@ -124,7 +121,7 @@ def compare(
     hide_changed(out / "scan.db", site.members[one], out / CHANGE_TIF)
     with ScanStore.open(out / "scan.db") as store:
         store.update_header(notes=(*store.header.notes, document["in_words"]))
-    write_files(out, tile_points, scheduler, progress)
+    write_files(out, options, progress)
     return document
 
 
@@ -144,27 +141,28 @@ def changes(
     out: Path,
     parts: tuple[tuple[int, int], tuple[int, int]],
     alignment_m: float,
-    cell_m: float | None = None,
-    tile_points: int = TILE_POINTS,
-    scheduler: str | None = None,
-    progress: Progress | None = None,
+    options: ExportOptions = USUAL,
     bare: bool = False,
 ) -> Changes | None:
     """Compare two dates of a site, ``parts`` of its keyframes, and write change.tif into ``out``.
 
     ``alignment_m`` is what the two are misaligned by (1 sigma). None where they share no ground.
     """
-    cut = view.tiling(ExportOptions(tile_points=tile_points), MARGIN_M)
+    cut, cell_m = view.tiling(options, MARGIN_M), options.cell_m
     whole: Grid | None = None
     voxels: tuple[float | None, ...] = (None, None)
     if len(cut.tiles) > 1:
         usual = [
-            float(np.median([p.sample_m for p in cut.prints if a <= p.seq <= b] or [cut.sample_m]))
+            float(
+                np.median(
+                    [p.ground_sample_m for p in cut.prints if a <= p.seq <= b] or [cut.sample_m]
+                )
+            )
             for a, b in parts
         ]
         voxels, whole = tuple(usual), over(grown(cut.bounds, 2.0), cell_m or max(usual))
     jobs = [ChangeJob(tile, parts, voxels, cell_m, whole, alignment_m, bare) for tile in cut.tiles]
-    made = run_tiles(change_tile, jobs, scheduler, progress or Progress())
+    made = run_tiles(change_tile, jobs, options.scheduler, view.progress)
     compared = (part for part in made if part is not None)
     first = next(compared, None)
     if first is None:
@@ -247,10 +245,19 @@ def _found(change: Change, body: Body, known: Bool) -> Found:
     r, c = np.nonzero(change.labels == body.label)
     rows, cols = (slice(int(x.min()), int(x.max()) + 1) for x in (r, c))
     cells = (change.labels[rows, cols] == body.label) & known[rows, cols]
-    return Found(
-        body, _object(change, body), outlines(change, body.label),
-        change.grid.part(rows, cols), cells,
-    )  # fmt: skip
+    east_m, north_m = change.grid.centres(r.mean(keepdims=True), c.mean(keepdims=True))[0].tolist()
+    about = {
+        "kind": "added" if body.volume_m3 > 0 else "removed",
+        "east_m": round(east_m, 2),
+        "north_m": round(north_m, 2),
+        "area_m2": round(body.area_m2, 2),
+        "volume_m3": round(body.volume_m3, 3),
+        "sigma_m3": round(body.sigma_m3, 3),
+        "mean_m": round(body.mean_m, 3),
+        "peak_m": round(body.peak_m, 3),
+    }
+    grid = change.grid.part(rows, cols)
+    return Found(body, about, outlines(change, body.label), grid, cells)
 
 
 def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
@@ -286,10 +293,7 @@ def surfaces(view: ScanView, job: ChangeJob) -> tuple[Raster, Raster] | None:
         return None
     places = [placed(fused.cloud, view.frame) for fused in clouds]
     cell = job.cell_m or max(fused.voxel_m for fused in clouds)
-    try:
-        grid = grid_over(np.vstack([p[:, :2] for p in places]), cell, margin_cells=1)
-    except ValueError as error:
-        raise InputError(f"{view.folder}: {error} with --cell-m") from error
+    grid = view.grid_of(np.vstack(places), cell)
     one, two = (
         level_filled(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
@@ -383,21 +387,6 @@ def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[st
 def _dated(member: Member) -> dict[str, Any]:
     when = dt.datetime.fromtimestamp(member.header.started_unix_ns / 1e9, dt.timezone.utc)
     return {"scan": member.name, "started": when.isoformat(timespec="seconds")}
-
-
-def _object(change: Change, body: Body) -> dict[str, Any]:
-    rows, cols = np.nonzero(change.labels == body.label)
-    grid = change.grid
-    return {
-        "kind": "added" if body.volume_m3 > 0 else "removed",
-        "east_m": round(grid.west_m + (float(cols.mean()) + 0.5) * grid.cell_m, 2),
-        "north_m": round(grid.north_m - (float(rows.mean()) + 0.5) * grid.cell_m, 2),
-        "area_m2": round(body.area_m2, 2),
-        "volume_m3": round(body.volume_m3, 3),
-        "sigma_m3": round(body.sigma_m3, 3),
-        "mean_m": round(body.mean_m, 3),
-        "peak_m": round(body.peak_m, 3),
-    }
 
 
 def _write_polygons(view: ScanView, path: Path, change: Changes) -> None:

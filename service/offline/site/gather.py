@@ -22,7 +22,7 @@ from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame, between_frames
 from service.offline.site import DRONE
-from service.offline.site.start import StartPoints
+from service.offline.site.start import Pair, placing
 from service.scans.main_piece import main_seqs
 from service.scans.track import local_frame
 from service.stream import codec
@@ -41,16 +41,10 @@ class Member:
     name: str
     folder: Path
     header: ScanHeader
-    T_site_scan: F64  # (4, 4) by the two origins alone
+    move: Similarity  # to the site, by the two origins or by points alone
     first: int  # its keyframes' numbers in the site's store
     last: int
-    scale: float = 1.0  # of a scan that points place
-    start: StartPoints | None = None
-
-    def placed(self, T: F64) -> F64:
-        """A (4, 4) pose of the scan in the site's frame."""
-        move = Similarity(self.scale, self.T_site_scan[:3, :3], self.T_site_scan[:3, 3])
-        return move.pose(T)
+    start: list[Pair] | None = None  # points that place it
 
     @property
     def seqs(self) -> range:
@@ -58,7 +52,7 @@ class Member:
 
 
 def gather(
-    folders: Sequence[Path], path: Path, name: str, starts: Mapping[Path, StartPoints] | None = None
+    folders: Sequence[Path], path: Path, name: str, starts: Mapping[Path, list[Pair]] | None = None
 ) -> tuple[list[Member], list[str]]:
     """Copy the keyframes of the scans in ``folders`` into a new store; its members, and notes.
 
@@ -96,7 +90,7 @@ def _opened(folder: Path) -> ScanStore:
 
 
 def _chosen(
-    folders: Sequence[Path], stores: Sequence[ScanStore], starts: Mapping[Path, StartPoints]
+    folders: Sequence[Path], stores: Sequence[ScanStore], starts: Mapping[Path, list[Pair]]
 ) -> tuple[list[tuple[Path, ScanStore]], list[str]]:
     """The scans that can be part of a site, and why others cannot."""
     chosen: list[tuple[Path, ScanStore]] = []
@@ -176,18 +170,17 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _copied(
     store: ScanStore, site: ScanStore, origin: LocalFrame, title: str, folder: Path, first: int,
-    starts: Mapping[Path, StartPoints],
+    starts: Mapping[Path, list[Pair]],
 ) -> Member:  # fmt: skip
     """Copy the layers of one scan's main piece under new numbers, from ``first`` on."""
-    frame, spread = local_frame(store.header), None
+    frame, spread, start = local_frame(store.header), None, None
     if frame is not None:
-        member = Member(title, folder, store.header, between_frames(origin, frame), first, 0)
+        T = between_frames(origin, frame)
+        move = Similarity(1.0, T[:3, :3], T[:3, 3])
     else:
         start = starts[folder.resolve()]
-        move, spread = start.placing(origin)
-        T = se3.compose(move.R, move.t)
-        member = Member(title, folder, store.header, T, first, 0, move.scale, start)
-    reposes, new = [], member.first
+        move, spread = placing(start, origin)
+    reposes, new = [], first
     for seq in main_seqs(store):
         repose = store.repose(seq)
         layers = []
@@ -196,7 +189,7 @@ def _copied(
             if opened is not None:
                 head, sections = opened
                 T = head.T_world_camera if repose is None else repose.T_world_camera
-                head = replace(head, seq=new, T_world_camera=member.placed(T))
+                head = replace(head, seq=new, T_world_camera=move.pose(T))
                 layers.append(codec.pack(head, sections))
         if not layers:
             continue  # only tiles of the narrow radio
@@ -204,13 +197,13 @@ def _copied(
         if spread is not None:
             T, scale = head.T_world_camera, 1.0 if repose is None else repose.scale
             around = se3.about(-T[:3, 3], spread)
-            reposes.append(Repose(new, 0, T, member.scale * scale, around))
+            reposes.append(Repose(new, 0, T, move.scale * scale, around))
         elif repose is not None:
-            T = member.placed(repose.T_world_camera)
+            T = move.pose(repose.T_world_camera)
             reposes.append(Repose(new, 0, T, repose.scale, repose.covariance))
         new += 1
     site.add_reposes(reposes)
-    return replace(member, last=new - 1)
+    return Member(title, folder, store.header, move, first, new - 1, start)
 
 
 def _copy_poses(
@@ -223,7 +216,7 @@ def _copy_poses(
     if any(after[0] <= before[1] for before, after in pairwise(ends)):
         return
     for track, k in tracks:
-        placed = (placed_pose(p, members[k].placed(p.T_world_camera), origin) for p in track)
+        placed = (placed_pose(p, members[k].move.pose(p.T_world_camera), origin) for p in track)
         site.add_poses(list(placed))
 
 

@@ -144,10 +144,7 @@ class FollowedScan:
 
     def moved(self) -> F64:
         """(N, 4, 4) poses after the alignment."""
-        out: F64 = self.poses.copy()
-        out[:, :3, :3] = self.move.R @ out[:, :3, :3]
-        out[:, :3, 3] = self.move.points(out[:, :3, 3])
-        return out
+        return self.move.pose(self.poses)
 
     def covariances(self) -> F64:
         """(N, 6, 6) of its poses, left perturbations in the site."""

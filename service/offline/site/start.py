@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,48 +42,41 @@ class Pair(msgspec.Struct, forbid_unknown_fields=True):
     ]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StartPoints:
-    """Points that place one scan."""
+def placing(pairs: Sequence[Pair], site: LocalFrame) -> tuple[Similarity, F64]:
+    """From the coordinates of the scan that ``pairs`` place to the site's, and (6, 6) its left
+    covariance there.
 
-    pairs: list[Pair]
-
-    def placing(self, site: LocalFrame) -> tuple[Similarity, F64]:
-        """From the scan's coordinates to the site's, and (6, 6) its left covariance there.
-
-        Raises InputError for too few points, points in a line, and points that disagree.
-        """
-        if not MIN_PAIRS <= len(self.pairs) <= MAX_PAIRS:
-            raise InputError(
-                f"a start takes {MIN_PAIRS} to {MAX_PAIRS} points, not {len(self.pairs)}"
-            )
-        here = np.array([pair.scan for pair in self.pairs])
-        lon, lat, alt = np.array([pair.place for pair in self.pairs]).T
-        there = site.to_enu(np.column_stack([lat, lon, alt]))
-        for points, which in ((here, "in the scan"), (there, "on the ground")):
-            size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-            if not size[1] > LINE * size[0]:
-                raise InputError(f"the points {which} lie in a line; choose a triangle")
-        move = umeyama(here, there)
-        assert move is not None  # they span a plane
-        extent = float(np.linalg.norm(there - there.mean(axis=0), axis=1).max())
-        miss = float(np.sqrt(np.mean(np.sum((move.points(here) - there) ** 2, axis=1))))
-        if move.scale <= 0.0 or miss > MAX_MISS * extent:
-            raise InputError(
-                f"the points contradict each other by {miss:.1f} m; check their order and places"
-            )
-        sigma = np.append(np.full(3, SIGMA_RAD), np.full(3, SIGMA_SHARE * extent))
-        return move, np.diag(sigma**2)
+    Raises InputError for too few points, points in a line, and points that disagree.
+    """
+    if not MIN_PAIRS <= len(pairs) <= MAX_PAIRS:
+        raise InputError(f"a start takes {MIN_PAIRS} to {MAX_PAIRS} points, not {len(pairs)}")
+    here = np.array([pair.scan for pair in pairs])
+    lon, lat, alt = np.array([pair.place for pair in pairs]).T
+    there = site.to_enu(np.column_stack([lat, lon, alt]))
+    for points, which in ((here, "in the scan"), (there, "on the ground")):
+        size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if not size[1] > LINE * size[0]:
+            raise InputError(f"the points {which} lie in a line; choose a triangle")
+    move = umeyama(here, there)
+    assert move is not None  # they span a plane
+    extent = float(np.linalg.norm(there - there.mean(axis=0), axis=1).max())
+    miss = float(np.sqrt(np.mean(np.sum((move.points(here) - there) ** 2, axis=1))))
+    if move.scale <= 0.0 or miss > MAX_MISS * extent:
+        raise InputError(
+            f"the points contradict each other by {miss:.1f} m; check their order and places"
+        )
+    sigma = np.append(np.full(3, SIGMA_RAD), np.full(3, SIGMA_SHARE * extent))
+    return move, np.diag(sigma**2)
 
 
-def read_start(path: Path) -> StartPoints:
+def read_start(path: Path) -> list[Pair]:
     """The points in a JSON file. Raises InputError for anything else."""
-    return StartPoints(read_json(path, list[Pair], MAX_BYTES, "list of points"))
+    return read_json(path, list[Pair], MAX_BYTES, "list of points")
 
 
-def start_of(rows: list[Any], name: str) -> StartPoints:
+def start_of(rows: list[Any], name: str) -> list[Pair]:
     """The points in what was read from JSON; ``name`` is for the error."""
     try:
-        return StartPoints(msgspec.convert(rows, list[Pair]))
+        return msgspec.convert(rows, list[Pair])
     except msgspec.ValidationError as error:
         raise InputError(f"{name} is no list of points: {error}"[:300]) from error

@@ -15,7 +15,7 @@ from recon.posegraph.loop_closure import LoopEnd
 from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import filled, verify_surfaces
 from recon.types import F64, DepthMap, Keyframe, Pose
-from service.offline.refine.stored_loops import StoredLoops, steps_m
+from service.offline.refine.stored_loops import steps_m, stored_loops
 
 SIZE = (320, 180)
 K = np.array([[240.0, 0.0, 159.5], [0.0, 240.0, 89.5], [0.0, 0.0, 1.0]])
@@ -162,7 +162,7 @@ def test_stored_keyframes_alone_bring_two_oblique_legs_together() -> None:
         stored.append(Keyframe(k, one.time_ns, kept, one.bgr, one.pose, one.fresh))
     spread = np.array([np.diag([0.01**2] * 3 + [1.0] * 3)] * 10)
     track = KeyframeTrack(flown, np.arange(10) * 5.0 + 40.0 * (np.arange(10) >= 5), spread)
-    found = supported(StoredLoops(track, stored.__getitem__, min_gap=5).find(), flown)
+    found = supported(stored_loops(track, stored.__getitem__, min_gap=5), flown)
     assert len(found) >= 3
     for loop in found:
         true = se3.inverse(truth[loop.a]) @ truth[loop.b]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,11 +25,11 @@ from service.cli import app
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.offline.exports import images, model
-from service.offline.exports.model import TileJob, TilePart, mesh_tile
-from service.offline.exports.view import ExportOptions, ScanView, export
-from service.offline.tiles import KeyframeFootprint, Tile, run_tiles, tile_boxes
+from service.offline.exports.model import TilePart, mesh_part
+from service.offline.exports.view import ExportOptions, ProductJob, ScanView, export, make_part
+from service.offline.tiles import Tile, run_tiles, tile_boxes
 from service.progress import Progress
-from service.scans.fused_cloud import EVERYWHERE
+from service.scans.fused_cloud import EVERYWHERE, Extent
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
@@ -43,7 +44,7 @@ def noting(said: list[str]) -> Progress:
     return Progress(lambda now: said.append(now.text))
 
 
-def jobs(folder: Path, count: int = 2) -> list[TileJob]:
+def jobs(folder: Path, count: int = 2) -> list[ProductJob]:
     edges = [-np.inf, *np.linspace(0, 20, count + 1)[1:-1], np.inf]
     each = [
         Tile(
@@ -52,11 +53,12 @@ def jobs(folder: Path, count: int = 2) -> list[TileJob]:
         )
         for west, east in pairwise(edges)
     ]  # fmt: skip
-    return [TileJob(tile, 0.3, 60_000, 2048) for tile in each]
+    make = partial(mesh_part, largest_faces=60_000, largest_px=2048)
+    return [ProductJob(tile, make, ExportOptions(voxel_m=0.3)) for tile in each]
 
 
-def made(some: list[TileJob], scheduler: str | None, progress: Progress) -> list[TilePart]:
-    return [one for one in run_tiles(mesh_tile, some, scheduler, progress) if one is not None]
+def made(some: list[ProductJob], scheduler: str | None, progress: Progress) -> list[TilePart]:
+    return [one for one in run_tiles(make_part, some, scheduler, progress) if one is not None]
 
 
 def same(a: list[TilePart], b: list[TilePart]) -> None:
@@ -70,8 +72,7 @@ def same(a: list[TilePart], b: list[TilePart]) -> None:
 
 def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
     prints = [
-        KeyframeFootprint(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20))
-        for n in range(20)
+        Extent(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20)) for n in range(20)
     ]
     assert tile_boxes(prints, 100_000) == [EVERYWHERE]
     boxes = tile_boxes(prints, 3000)
@@ -155,7 +156,7 @@ def test_a_scheduler_that_is_not_there_ends_in_one_line(tmp_path: Path, house: H
     pytest.importorskip("distributed")
     house.flown(tmp_path).close()
     with pytest.raises(OutsideError, match="no Dask scheduler answers"):
-        next(run_tiles(mesh_tile, jobs(tmp_path), "tcp://127.0.0.1:9", Progress(), connect_s=0.5))
+        next(run_tiles(make_part, jobs(tmp_path), "tcp://127.0.0.1:9", Progress(), connect_s=0.5))
 
 
 @pytest.mark.slow
@@ -238,8 +239,8 @@ def test_the_file_names_no_path_of_this_machine(
     mesh = Mesh(corner, np.array([[0, 1, 2]], np.int32), rgb=np.full((3, 3), 90, np.uint8))
     figures = {"faces": 1, "vertices": 3, "seen": 1.0, "measured": 1.0, "texture_px": [1, 1]}
     part = Mock(mesh=mesh, image=None, figures=figures)
-    monkeypatch.setattr(model, "run_tiles", lambda *_: [part])
-    monkeypatch.setattr(model, "check_video", lambda *_: None)
+    monkeypatch.setattr(model, "in_parts", lambda *_, **__: iter([part]))
+    monkeypatch.setattr(model, "opened", lambda *_: Mock())
     options = ExportOptions(video=tmp_path / "flight.mp4")
     with ScanView(tmp_path / "scan") as scan:
         said = model.write_mesh(scan, tmp_path / "mesh.glb", model.LARGEST_FACES, options)
@@ -310,10 +311,10 @@ def test_a_recording_found_by_itself_that_does_not_fit_is_left(
     video.touch()
     monkeypatch.setattr(images, "recording_of", lambda *_: images.Recording(video, ""))
     (job, *_), reported = jobs(tmp_path), list[str]()
-    assert mesh_tile(job, noting(reported)) is not None
+    assert make_part(job, noting(reported)) is not None
     assert any("after all" in text for text in reported)
     with pytest.raises(InputError, match="contains no camera model"):
-        mesh_tile(replace(job, options=ExportOptions(video=video)), noting(reported))
+        make_part(replace(job, options=ExportOptions(video=video)), noting(reported))
 
 
 def test_models_share_surface_images_and_texture(

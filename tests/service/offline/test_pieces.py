@@ -27,9 +27,10 @@ from service.cli import app
 from service.errors import InputError
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.refine.by_images import stretches_untied
-from service.offline.tiles import footprints
+from service.progress import Progress
 from service.scans.coverage import LiveCoverage, coverage_of
 from service.scans.folder import write_deliverables
+from service.scans.fused_cloud import extents_of
 from service.scans.main_piece import main_poses, main_seqs
 from service.stream.store import ScanStore
 
@@ -197,7 +198,7 @@ def test_no_deliverable_shows_what_is_apart(tmp_path: Path, house: HouseFlight) 
     assert "2 of 5 keyframes" in (tmp_path / "report.html").read_text(encoding="utf-8")
     with ScanView(tmp_path) as view:
         assert [p.keyframe_seq for p in view.poses] == [0, 1, 2]
-        assert [p.seq for p in footprints(view.store)] == [0, 1, 2]
+        assert [p.seq for p in extents_of(view.store, Progress())[0]] == [0, 1, 2]
         assert len(view.off_nadir_deg) == 3
         east = [export(view, kind, None, ExportOptions(cell_m=1.0)) for kind in ("dsm", "geojson")]
     with rasterio.open(east[0]) as dsm:

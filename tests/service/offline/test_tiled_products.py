@@ -160,7 +160,7 @@ def test_the_files_of_a_site_in_tiles_are_those_of_the_whole(
     scans = [write_scan(tmp_path / f"{k}", leg(k * np.pi / 2), day=k) for k in range(2)]
     clouds_of, facts = [], []
     for name, points in (("whole", 20_000_000), ("tiles", 60_000)):
-        align_site(scans, tmp_path / name, tile_points=points)
+        align_site(scans, tmp_path / name, options=ExportOptions(tile_points=points))
         clouds_of.append(laspy.read(tmp_path / name / "cloud.laz"))
         facts.append(json.loads((tmp_path / name / "scan.json").read_text()))
         assert facts[-1]["failed"] == {} and (tmp_path / name / "report.html").is_file()
@@ -220,7 +220,8 @@ def test_changes_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: list[i
     with ScanView(tmp_path / "site") as view:
         for name, points in (("whole", 20_000_000), ("tiles", 120_000)):
             (tmp_path / name).mkdir()
-            done = compare.changes(view, tmp_path / name, (parts[0], parts[1]), 0.05, 0.25, points)
+            options = ExportOptions(cell_m=0.25, tile_points=points)
+            done = compare.changes(view, tmp_path / name, (parts[0], parts[1]), 0.05, options)
             assert done is not None
             found.append(done)
     assert counted[0] == 1 and counted[1] > 1

@@ -285,11 +285,11 @@ def test_a_large_site_is_fused_strip_by_strip_to_the_same_cloud(
 
 
 def test_strips_hold_equal_shares() -> None:
-    extents = [Extent(k, 1000, 0.2, 5.0 * k, 5.0 * k + 40.0) for k in range(100)]
+    extents = [Extent(k, 1000, 0.2, (5.0 * k, 0.0, 5.0 * k + 40.0, 30.0)) for k in range(100)]
     edges = strip_edges(extents, 9000)
     assert edges[0] == -np.inf and edges[-1] == np.inf
     assert len(edges) == 13
-    x = np.concatenate([np.linspace(e.west_m, e.east_m, 1000) for e in extents])
+    x = np.concatenate([np.linspace(e.box[0], e.box[2], 1000) for e in extents])
     shares = np.histogram(x, [x.min() - 1, *edges[1:-1], x.max() + 1])[0]
     assert shares.max() < 9000
     assert strip_edges([], 10) == [-np.inf, np.inf]
