@@ -117,19 +117,18 @@ def run_benchmarks(
 
 def table(results: list[BenchResult], before: Mapping[tuple[str, str], float] | None = None) -> str:
     """The results as aligned text, one line a figure; ``before`` has earlier ones by its names."""
-    rows: list[tuple[str, ...]] = [
-        ("benchmark", "figure", "ours", "spread", "peer", "theirs", "ratio", "before", "note")
-    ]
+    rows = [["benchmark", "figure", "ours", "spread", "peer", "theirs", "ratio", "before", "note"]]
     for r in results:
         earlier = (before or {}).get((r.name, r.what))
-        theirs = "" if r.peer_value is None else f"{r.peer_value:.3g} {r.unit}"
-        ratio = "" if r.ratio is None else f"{r.ratio:.2f}"
-        spread = f"{r.spread:.2g}" if r.spread else ""
-        ours, then = f"{r.value:.3g} {r.unit}", "" if earlier is None else f"{earlier:.3g}"
-        rows.append((r.name, r.what, ours, spread, r.peer, theirs, ratio, then, r.note))
+        rows.append([
+            r.name, r.what, f"{r.value:.3g} {r.unit}", f"{r.spread:.2g}" if r.spread else "",
+            r.peer, "" if r.peer_value is None else f"{r.peer_value:.3g} {r.unit}",
+            "" if r.ratio is None else f"{r.ratio:.2f}",
+            "" if earlier is None else f"{earlier:.3g}", r.note,
+        ])  # fmt: skip
     if not before:
-        rows = [(*row[:-2], row[-1]) for row in rows]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+        rows = [[*row[:-2], row[-1]] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
     return "\n".join(line.rstrip() for line in lines)
 

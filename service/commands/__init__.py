@@ -81,11 +81,11 @@ def one_of(action: str, actions: Sequence[str], command: str) -> None:
         raise InputError(f"{command} {action}: there are {', '.join(actions)}")
 
 
-def parse_size(text: str, option: str) -> tuple[int, int]:
-    """(W, H) of ``WxH``; InputError, which names the option, for anything else."""
+def parse_size(text: str) -> tuple[int, int]:
+    """(W, H) of ``WxH``; InputError for anything else."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.strip())
     if found is None:
-        raise InputError(f"{option} {text!r}: give WIDTHxHEIGHT, such as 1280x720")
+        raise InputError(f"--size {text!r}: give WIDTHxHEIGHT, such as 1280x720")
     return int(found[1]), int(found[2])
 
 

@@ -128,7 +128,7 @@ class SimulateOptions:
             ),
             look=Look(noise=self.image_noise, water_m=self.water_m),
             faults=Faults(tuple((int(a), int(b)) for a, b in blank), tuple(sorted(exposure))),
-            size_px=parse_size(self.size, "--size"),
+            size_px=parse_size(self.size),
             focal_share=self.focal,
             distortion=DISTORTION if self.distortion else (0.0,) * 5,
             with_telemetry=self.telemetry,

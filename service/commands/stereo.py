@@ -146,7 +146,7 @@ def export_model(
     The model takes left, right (1, 1, h, w) float32 gray levels and gives disparity (1, 1, h, w),
     px.
     """
-    width, height = parse_size(size, "--size")
+    width, height = parse_size(size)
     if not (8 <= width <= 8192 and 8 <= height <= 8192):
         raise InputError(f"--size {size!r}: sides are 8 to 8192")
     check_output(out, ".onnx")

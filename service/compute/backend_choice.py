@@ -241,13 +241,13 @@ def load_learned_model(declaration: Path) -> LearnedStereoBackend:
         known = {f.name: f for f in fields(LearnedStereoConfig)}
         strange = sorted(set(given) - set(known))
         missing = sorted(n for n, f in known.items() if f.default is MISSING and n not in given)
-        if strange or missing or not model.is_file():
-            raise InputError(
-                f"{declaration}: "
-                + (f"unknown {', '.join(strange)}; known are model, {', '.join(known)}" if strange
-                   else f"{', '.join(missing)} must be given" if missing
-                   else f"model = {model.name!r} is not a file next to it")
-            )  # fmt: skip
+        if strange:
+            words = f"unknown {', '.join(strange)}; known are model, {', '.join(known)}"
+            raise InputError(f"{declaration}: {words}")
+        if missing:
+            raise InputError(f"{declaration}: {', '.join(missing)} must be given")
+        if not model.is_file():
+            raise InputError(f"{declaration}: model = {model.name!r} is not a file next to it")
         config = LearnedStereoConfig(**given)
         return LearnedStereoBackend(model.read_bytes(), config, engine_folder())
     except OSError as error:
