@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -18,6 +19,8 @@ from service.sim.noise import fractal2
 from service.sim.shapes import FLAT, GABLED, PLAIN, VEHICLE, Body
 
 ASPHALT, DIRT = 1, 2
+TERRAIN_STEP_M = 1.0
+Colour = tuple[int, ...]
 ROOFS = ((50, 62, 128), (58, 80, 140), (72, 72, 78), (62, 68, 96), (96, 92, 90))
 WALLS = ((196, 206, 212), (150, 182, 206), (120, 150, 190), (205, 205, 200), (110, 120, 160))
 CHANGE_M, CHANGE_HEIGHT_M = (1.0, 4.0), (0.3, 2.5)
@@ -69,38 +72,44 @@ def make(
 
     Of ``changes`` boxes the first half stands at ``date`` 1 only, the others at ``date`` 2.
     """
-    rng = np.random.default_rng(seed)
-    ground = make_terrain(area, relief_m, 1.0, seed)
-    roads = _roads(area, rng)
-    free = _FreeGround(area, roads)
-    blocks = _houses(roads, ground, free, density, rng)
-    blocks += _cars(area, roads, ground, density, rng)
-    trees, heights, trunks = _trees(area, ground, free, density, rng)
-    boxes, changed = _changes(area, ground, free, changes, seed)
-    blocks += [box for box, change in zip(boxes, changed, strict=True) if change.date == date]
-    table = np.array(blocks + trunks) if blocks or trunks else np.zeros((0, shapes.COLUMNS))
+    layout = _Layout(area, relief_m, density, seed)
+    layout.add_houses()
+    layout.add_cars()
+    layout.add_trees()
+    changed = layout.add_changes(changes, date, seed)
+    blocks = layout.blocks + layout.trunks
+    table = np.array(blocks) if blocks else np.zeros((0, shapes.COLUMNS))
+    trees = np.array(layout.trees) if layout.trees else np.zeros((0, 8))
     vertices, triangles, material, owner = shapes.joined([
-        _ground_body(ground, table),
+        _ground_body(layout.ground, table),
         *(body for k, block in enumerate(table) for body in shapes.block_bodies(block, k)),
-        *(shapes.crown(tree, float(heights[k]), k) for k, tree in enumerate(trees)),
+        *(shapes.crown(tree, layout.heights_m[k], k) for k, tree in enumerate(trees)),
     ])  # fmt: skip
     grid = triangle_grid.build(vertices, triangles, 1.0)
     return Scene(
-        area, ground, roads, table, trees, vertices, triangles, material, owner, grid, seed,
-        tuple(changed),
+        area, layout.ground, layout.roads, table, trees, vertices, triangles, material, owner, grid,
+        seed, tuple(changed),
     )  # fmt: skip
 
 
-class _FreeGround:
-    """Where nothing stands yet, on squares of half a metre."""
+class _Layout:
+    """The place while it is laid out: what stands, and where nothing does, on squares of half a
+    metre."""
 
     STEP_M = 0.5
 
-    def __init__(self, area: Area, roads: tuple[Road, ...]) -> None:
-        self.area = area
+    def __init__(self, area: Area, relief_m: float, density: float, seed: int) -> None:
+        self.area, self.density = area, density
+        self.rng = np.random.default_rng(seed)
+        self.ground = make_terrain(area, relief_m, seed)
+        self.roads = self._roads()
+        self.blocks: list[F64] = []
+        self.trees: list[F64] = []
+        self.heights_m: list[float] = []  # of the trees
+        self.trunks: list[F64] = []  # blocks
         w, h = (int(np.ceil(s / self.STEP_M)) for s in area.size_m)
         self.taken = np.zeros((h, w), np.uint8)
-        for road in roads:
+        for road in self.roads:
             thickness = max(1, round((road.width_m + 1.5) / self.STEP_M))
             cv2.polylines(self.taken, [self._cells(road.line)], False, 255, thickness)
 
@@ -122,82 +131,68 @@ class _FreeGround:
         self.taken |= mask
         return True
 
+    def _roads(self) -> tuple[Road, ...]:
+        """A main road through the middle, a side road across it, and dirt tracks."""
+        area, rng = self.area, self.rng
+        middle = np.array([0.5 * (area.x0 + area.x1), 0.5 * (area.y0 + area.y1)])
+        reach = float(np.hypot(*area.size_m))
+        along = float(np.arctan2(area.size_m[1], area.size_m[0]) + rng.uniform(-0.2, 0.2))
+        roads = [Road(self._bent(middle, along, reach, 9.0), 6.2, ASPHALT)]
+        sides = max(1, round(reach / 130.0))
+        for k in range(sides):
+            share = (k + 0.5) / sides - 0.5
+            start = middle + 0.8 * share * reach * np.array([np.cos(along), np.sin(along)])
+            angle = along + np.pi / 2 + rng.uniform(-0.35, 0.35)
+            roads.append(Road(self._bent(start, angle, reach, 6.0), 4.8, ASPHALT))
+        for _ in range(max(1, round(reach / 160.0))):
+            start = middle + rng.uniform(-0.3, 0.3, 2) * reach
+            roads.append(Road(self._bent(start, rng.uniform(0, np.pi), reach, 12.0), 2.6, DIRT))
+        return tuple(roads)
 
-def _roads(area: Area, rng: np.random.Generator) -> tuple[Road, ...]:
-    """A main road through the middle, a side road across it, and dirt tracks."""
-    middle = np.array([0.5 * (area.x0 + area.x1), 0.5 * (area.y0 + area.y1)])
-    reach = float(np.hypot(*area.size_m))
-    along = float(np.arctan2(area.size_m[1], area.size_m[0]) + rng.uniform(-0.2, 0.2))
-    roads = [Road(_bent(middle, along, reach, 9.0, rng), 6.2, ASPHALT)]
-    for k in range(max(1, round(reach / 130.0))):
-        share = (k + 0.5) / max(1, round(reach / 130.0)) - 0.5
-        start = middle + 0.8 * share * reach * np.array([np.cos(along), np.sin(along)])
-        angle = along + np.pi / 2 + rng.uniform(-0.35, 0.35)
-        roads.append(Road(_bent(start, angle, reach, 6.0, rng), 4.8, ASPHALT))
-    for _ in range(max(1, round(reach / 160.0))):
-        start = middle + rng.uniform(-0.3, 0.3, 2) * reach
-        roads.append(Road(_bent(start, rng.uniform(0, np.pi), reach, 12.0, rng), 2.6, DIRT))
-    return tuple(roads)
+    def _bent(self, start: F64, angle: float, reach_m: float, bend_m: float) -> F64:
+        """(N, 2) a line through ``start``, swinging ``bend_m`` to either side."""
+        s = np.arange(-reach_m, reach_m, 2.0)
+        phase, length = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(110, 190)
+        swing = bend_m * (np.sin(2 * np.pi * s / length + phase) - np.sin(phase))
+        ahead = np.array([np.cos(angle), np.sin(angle)])
+        return np.asarray(start + np.outer(s, ahead) + np.outer(swing, [-ahead[1], ahead[0]]))
 
+    def _stations(self, gap_m: tuple[float, float]) -> Iterator[tuple[Road, float, float, float]]:
+        """Asphalt roads with x, y and heading at random gaps along each."""
+        for road in (r for r in self.roads if r.surface == ASPHALT):
+            steps = np.diff(road.line, axis=0)
+            s = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
+            heading = np.arctan2(steps[:, 1], steps[:, 0])
+            places, at = [], self.rng.uniform(0, gap_m[1])
+            while at < s[-1]:
+                k = min(int(np.searchsorted(s, at, "right")) - 1, len(heading) - 1)
+                x, y = np.interp(at, s, road.line[:, 0]), np.interp(at, s, road.line[:, 1])
+                places.append((road, float(x), float(y), float(heading[k])))
+                at += self.rng.uniform(*gap_m)
+            yield from places  # drawn all before what stands there
 
-def _bent(start: F64, angle: float, reach_m: float, bend_m: float, rng: np.random.Generator) -> F64:
-    """(N, 2) a line through ``start``, swinging ``bend_m`` to either side."""
-    s = np.arange(-reach_m, reach_m, 2.0)
-    phase, length = rng.uniform(0, 2 * np.pi), rng.uniform(110, 190)
-    swing = bend_m * (np.sin(2 * np.pi * s / length + phase) - np.sin(phase))
-    ahead = np.array([np.cos(angle), np.sin(angle)])
-    return np.asarray(start + np.outer(s, ahead) + np.outer(swing, [-ahead[1], ahead[0]]))
+    def _stand(self, row: F64, eave_m: float, ridge_m: float) -> None:
+        """Set a block's heights: its floor on the highest ground below it, its walls into it."""
+        corners = np.vstack([shapes.footprint(row), row[[shapes.X, shapes.Y]]])
+        z = self.ground.height(corners[:, 0], corners[:, 1])
+        floor = float(z.max())
+        row[shapes.BASE], row[shapes.EAVE] = float(z.min()) - 0.5, floor + eave_m
+        row[shapes.RIDGE] = floor + eave_m + ridge_m
 
+    def _paint(self, row: F64, top: Colour, wall: Colour) -> None:
+        row[shapes.TOP_B : shapes.TOP_R + 1] = np.array(top) * self.rng.uniform(0.85, 1.15)
+        row[shapes.WALL_B : shapes.WALL_R + 1] = np.array(wall) * self.rng.uniform(0.85, 1.1)
+        row[shapes.SEED] = int(self.rng.integers(1, 1 << 20))
 
-def _stations(road: Road, gap_m: tuple[float, float], rng: np.random.Generator) -> list[F64]:
-    """Rows (x, y, heading) along a road at random gaps."""
-    steps = np.diff(road.line, axis=0)
-    s = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
-    heading = np.arctan2(steps[:, 1], steps[:, 0])
-    out, at = [], rng.uniform(0, gap_m[1])
-    while at < s[-1]:
-        k = min(int(np.searchsorted(s, at, "right")) - 1, len(heading) - 1)
-        x, y = np.interp(at, s, road.line[:, 0]), np.interp(at, s, road.line[:, 1])
-        out.append(np.array([x, y, heading[k]]))
-        at += rng.uniform(*gap_m)
-    return out
+    def _pick(self, colours: tuple[Colour, ...]) -> Colour:
+        return colours[int(self.rng.integers(len(colours)))]
 
-
-def _block(kind: float, x: float, y: float, heading: float, size: tuple[float, float]) -> F64:
-    """A row of the block table with its plan; heights and colours are still zero."""
-    row = np.zeros(shapes.COLUMNS)
-    row[: shapes.BASE] = kind, x, y, np.cos(heading), np.sin(heading), size[0] / 2, size[1] / 2
-    return row
-
-
-def _stand(row: F64, ground: HeightField, eave_m: float, ridge_m: float) -> None:
-    """Set a block's heights: its floor on the highest ground below it, its walls into it."""
-    corners = np.vstack([shapes.footprint(row), row[[shapes.X, shapes.Y]]])
-    z = ground.height(corners[:, 0], corners[:, 1])
-    floor = float(z.max())
-    row[shapes.BASE], row[shapes.EAVE] = float(z.min()) - 0.5, floor + eave_m
-    row[shapes.RIDGE] = floor + eave_m + ridge_m
-
-
-def _paint(row: F64, top: tuple[int, ...], wall: tuple[int, ...], rng: np.random.Generator) -> None:
-    row[shapes.TOP_B : shapes.TOP_R + 1] = np.array(top) * rng.uniform(0.85, 1.15)
-    row[shapes.WALL_B : shapes.WALL_R + 1] = np.array(wall) * rng.uniform(0.85, 1.1)
-    row[shapes.SEED] = int(rng.integers(1, 1 << 20))
-
-
-def _houses(
-    roads: tuple[Road, ...],
-    ground: HeightField,
-    free: _FreeGround,
-    density: float,
-    rng: np.random.Generator,
-) -> list[F64]:
-    """Houses, halls and garages along the asphalt roads, with chimneys."""
-    out: list[F64] = []
-    for road in (r for r in roads if r.surface == ASPHALT):
-        for x, y, heading in _stations(road, (15.0, 30.0), rng):
+    def add_houses(self) -> None:
+        """Houses, halls and garages along the asphalt roads, with chimneys."""
+        rng = self.rng
+        for road, x, y, heading in self._stations((15.0, 30.0)):
             for side in (-1.0, 1.0):
-                if rng.uniform() > 0.75 * density:
+                if rng.uniform() > 0.75 * self.density:
                     continue
                 hall = rng.uniform() < 0.12
                 size = (
@@ -209,125 +204,111 @@ def _houses(
                 hx, hy = x - side * away * np.sin(heading), y + side * away * np.cos(heading)
                 kind = FLAT if hall or rng.uniform() < 0.2 else GABLED
                 row = _block(kind, hx, hy, heading + rng.uniform(-0.06, 0.06), size)
-                if free.take(shapes.footprint(row, 1.5)):
-                    _stand(row, ground, rng.uniform(3.0, 6.5), 0.5 * size[1] * rng.uniform(0.6, 1))
-                    _paint(row, _pick(ROOFS, rng), _pick(WALLS, rng), rng)
-                    out += [row, *_next_to(row, ground, free, rng)]
-    return out
+                if self.take(shapes.footprint(row, 1.5)):
+                    self._stand(row, rng.uniform(3.0, 6.5), 0.5 * size[1] * rng.uniform(0.6, 1))
+                    self._paint(row, self._pick(ROOFS), self._pick(WALLS))
+                    self.blocks.append(row)
+                    self._add_next_to(row)
 
+    def _add_next_to(self, house: F64) -> None:
+        """A chimney on the roof and perhaps a garage next to a house."""
+        rng = self.rng
+        heading = float(np.arctan2(house[shapes.SIN], house[shapes.COS]))
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        at = house[[shapes.X, shapes.Y]]
+        if house[shapes.KIND] == GABLED:
+            x, y = at + ahead * house[shapes.HALF_L] * rng.uniform(-0.6, 0.6)
+            row = _block(PLAIN, x, y, heading, (0.8, 0.6))
+            row[shapes.BASE], row[shapes.EAVE] = house[shapes.EAVE], house[shapes.RIDGE] + 0.9
+            self._paint(row, (70, 75, 90), (70, 80, 120))
+            self.blocks.append(row)
+        if rng.uniform() < 0.5:
+            length = rng.uniform(5.5, 7)
+            x, y = at + ahead * (house[shapes.HALF_L] + length / 2 + 1.8)
+            row = _block(FLAT, x, y, heading, (length, rng.uniform(3.2, 6)))
+            if self.take(shapes.footprint(row, 0.2)):
+                self._stand(row, rng.uniform(2.3, 2.8), 0.0)
+                self._paint(row, (120, 122, 124), self._pick(WALLS))
+                self.blocks.append(row)
 
-def _pick(colours: tuple[tuple[int, ...], ...], rng: np.random.Generator) -> tuple[int, ...]:
-    return colours[int(rng.integers(len(colours)))]
-
-
-def _next_to(
-    house: F64, ground: HeightField, free: _FreeGround, rng: np.random.Generator
-) -> list[F64]:
-    """A chimney on the roof and perhaps a garage next to a house."""
-    out = []
-    heading = float(np.arctan2(house[shapes.SIN], house[shapes.COS]))
-    ahead = np.array([np.cos(heading), np.sin(heading)])
-    if house[shapes.KIND] == GABLED:
-        x, y = house[[shapes.X, shapes.Y]] + ahead * house[shapes.HALF_L] * rng.uniform(-0.6, 0.6)
-        row = _block(PLAIN, x, y, heading, (0.8, 0.6))
-        row[shapes.BASE], row[shapes.EAVE] = house[shapes.EAVE], house[shapes.RIDGE] + 0.9
-        _paint(row, (70, 75, 90), (70, 80, 120), rng)
-        out.append(row)
-    if rng.uniform() < 0.5:
-        length = rng.uniform(5.5, 7)
-        x, y = house[[shapes.X, shapes.Y]] + ahead * (house[shapes.HALF_L] + length / 2 + 1.8)
-        row = _block(FLAT, x, y, heading, (length, rng.uniform(3.2, 6)))
-        if free.take(shapes.footprint(row, 0.2)):
-            _stand(row, ground, rng.uniform(2.3, 2.8), 0.0)
-            _paint(row, (120, 122, 124), _pick(WALLS, rng), rng)
-            out.append(row)
-    return out
-
-
-def _cars(
-    area: Area,
-    roads: tuple[Road, ...],
-    ground: HeightField,
-    density: float,
-    rng: np.random.Generator,
-) -> list[F64]:
-    """Parked cars at the kerb: a body and a cabin each."""
-    out = []
-    for road in (r for r in roads if r.surface == ASPHALT):
-        for x, y, heading in _stations(road, (12.0, 60.0), rng):
-            if rng.uniform() > density:
+    def add_cars(self) -> None:
+        """Parked cars at the kerb: a body and a cabin each."""
+        area = self.area
+        for road, x, y, heading in self._stations((12.0, 60.0)):
+            if self.rng.uniform() > self.density:
                 continue
-            side = rng.choice([-1.0, 1.0]) * (road.width_m / 2 - 1.1)
+            side = self.rng.choice([-1.0, 1.0]) * (road.width_m / 2 - 1.1)
             cx, cy = x - side * np.sin(heading), y + side * np.cos(heading)
             if not (area.x0 + 3 < cx < area.x1 - 3 and area.y0 + 3 < cy < area.y1 - 3):
                 continue
             body = _block(VEHICLE, cx, cy, heading, (4.4, 1.8))
             cabin = _block(VEHICLE, cx - 0.2 * np.cos(heading), cy - 0.2 * np.sin(heading),
                            heading, (2.3, 1.55))  # fmt: skip
-            _stand(body, ground, 0.85, 0.0)
-            _paint(body, _pick(PAINTS, rng), (60, 60, 60), rng)
+            self._stand(body, 0.85, 0.0)
+            self._paint(body, self._pick(PAINTS), (60, 60, 60))
             cabin[shapes.TOP_B :] = body[shapes.TOP_B :]
             cabin[shapes.WALL_B : shapes.WALL_R + 1] = 45, 40, 38
             cabin[shapes.BASE], cabin[shapes.EAVE] = body[shapes.EAVE], body[shapes.EAVE] + 0.6
-            out += [body, cabin]
-    return out
+            self.blocks += [body, cabin]
+
+    def add_changes(self, count: int, date: int, seed: int) -> list[ChangedBox]:
+        """Boxes on free ground in the inner two thirds of the area, for one of two dates each;
+        those of ``date`` stand."""
+        area, self.rng = self.area, np.random.default_rng(seed + 77)
+        middle = np.array([0.5 * (area.x0 + area.x1), 0.5 * (area.y0 + area.y1)])
+        found: list[ChangedBox] = []
+        for _ in range(1000 * count):
+            if len(found) == count:
+                break
+            x, y = middle + self.rng.uniform(-1 / 3, 1 / 3, 2) * area.size_m
+            size = self.rng.uniform(*CHANGE_M), self.rng.uniform(*CHANGE_M)
+            row = _block(FLAT, float(x), float(y), self.rng.uniform(0, np.pi), size)
+            height = float(self.rng.uniform(*CHANGE_HEIGHT_M))
+            if not self.take(shapes.footprint(row, 2.0)):
+                continue
+            self._stand(row, height, 0.0)
+            self._paint(row, self._pick(ROOFS), self._pick(WALLS))
+            gx, gy = np.meshgrid(*(np.arange(c - 4.0, c + 4.0, 0.05) for c in (x, y)))
+            under = shapes.inside(row, gx, gy)
+            level = self.ground.height(gx[under], gy[under])
+            volume = float((row[shapes.EAVE] - level).mean() * size[0] * size[1])
+            outline = tuple((float(a), float(b)) for a, b in shapes.footprint(row))
+            box = ChangedBox(outline, height, volume, 1 if len(found) < count // 2 else 2)
+            found.append(box)
+            if box.date == date:
+                self.blocks.append(row)
+        return found
+
+    def add_trees(self) -> None:
+        """Groves, single trees and bushes."""
+        area, rng = self.area, self.rng
+        surface = area.size_m[0] * area.size_m[1]
+        groves = max(3, int(surface / 3000))
+        centres = rng.uniform([area.x0, area.y0], [area.x1, area.y1], (groves, 2))
+        for _ in range(int(surface * (0.002 + 0.006 * min(1.0, self.density)))):
+            bush = rng.uniform() < 0.45
+            at = centres[int(rng.integers(len(centres)))] + rng.normal(0, 12.0, 2)
+            radius = rng.uniform(0.7, 1.4) if bush else rng.uniform(2.0, 4.2)
+            height = radius * (rng.uniform(1.2, 1.6) if bush else rng.uniform(2.2, 2.8))
+            if not self.take(at + 0.8 * radius * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])):
+                continue
+            z = float(self.ground.height(at[:1], at[1:])[0])
+            green = np.array([38, 82, 62]) * rng.uniform(0.75, 1.25) + rng.uniform(-8, 8, 3)
+            own_seed = int(rng.integers(1, 1 << 20))
+            self.trees.append(np.array([at[0], at[1], z, radius, *green, own_seed]))
+            self.heights_m.append(float(height))
+            if not bush:
+                trunk = _block(PLAIN, at[0], at[1], 0.3, (0.36, 0.36))
+                trunk[shapes.BASE], trunk[shapes.EAVE] = z - 0.3, z + 0.6 * height
+                trunk[shapes.WALL_B : shapes.WALL_R + 1] = 50, 62, 78
+                self.trunks.append(trunk)
 
 
-def _changes(
-    area: Area, ground: HeightField, free: _FreeGround, count: int, seed: int
-) -> tuple[list[F64], list[ChangedBox]]:
-    """Boxes on free ground in the inner two thirds of the area, for one of two dates each."""
-    rng = np.random.default_rng(seed + 77)
-    middle = np.array([0.5 * (area.x0 + area.x1), 0.5 * (area.y0 + area.y1)])
-    rows: list[F64] = []
-    found: list[ChangedBox] = []
-    for _ in range(1000 * count):
-        if len(rows) == count:
-            break
-        x, y = middle + rng.uniform(-1 / 3, 1 / 3, 2) * area.size_m
-        size = rng.uniform(*CHANGE_M), rng.uniform(*CHANGE_M)
-        row = _block(FLAT, float(x), float(y), rng.uniform(0, np.pi), size)
-        height = float(rng.uniform(*CHANGE_HEIGHT_M))
-        if not free.take(shapes.footprint(row, 2.0)):
-            continue
-        _stand(row, ground, height, 0.0)
-        _paint(row, _pick(ROOFS, rng), _pick(WALLS, rng), rng)
-        gx, gy = np.meshgrid(*(np.arange(c - 4.0, c + 4.0, 0.05) for c in (x, y)))
-        under = shapes.inside(row, gx, gy)
-        level = ground.height(gx[under], gy[under])
-        volume = float((row[shapes.EAVE] - level).mean() * size[0] * size[1])
-        outline = tuple((float(a), float(b)) for a, b in shapes.footprint(row))
-        rows.append(row)
-        found.append(ChangedBox(outline, height, volume, 1 if len(rows) <= count // 2 else 2))
-    return rows, found
-
-
-def _trees(
-    area: Area, ground: HeightField, free: _FreeGround, density: float, rng: np.random.Generator
-) -> tuple[F64, F64, list[F64]]:
-    """(tree table, heights, trunks as blocks): groves, single trees and bushes."""
-    surface = area.size_m[0] * area.size_m[1]
-    centres = rng.uniform([area.x0, area.y0], [area.x1, area.y1], (max(3, int(surface / 3000)), 2))
-    rows, heights, trunks = [], [], []
-    for _ in range(int(surface * (0.002 + 0.006 * min(1.0, density)))):
-        bush = rng.uniform() < 0.45
-        at = centres[int(rng.integers(len(centres)))] + rng.normal(0, 12.0, 2)
-        radius = rng.uniform(0.7, 1.4) if bush else rng.uniform(2.0, 4.2)
-        height = radius * (rng.uniform(1.2, 1.6) if bush else rng.uniform(2.2, 2.8))
-        corners = at + 0.8 * radius * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        if not free.take(corners):
-            continue
-        z = float(ground.height(at[:1], at[1:])[0])
-        green = np.array([38, 82, 62]) * rng.uniform(0.75, 1.25) + rng.uniform(-8, 8, 3)
-        rows.append(np.array([at[0], at[1], z, radius, *green, int(rng.integers(1, 1 << 20))]))
-        heights.append(height)
-        if not bush:
-            trunk = _block(PLAIN, at[0], at[1], 0.3, (0.36, 0.36))
-            trunk[shapes.BASE], trunk[shapes.EAVE] = z - 0.3, z + 0.6 * height
-            trunk[shapes.WALL_B : shapes.WALL_R + 1] = 50, 62, 78
-            trunks.append(trunk)
-    table = np.array(rows) if rows else np.zeros((0, 8))
-    return table, np.array(heights), trunks
+def _block(kind: float, x: float, y: float, heading: float, size: tuple[float, float]) -> F64:
+    """A row of the block table with its plan; heights and colours are still zero."""
+    row = np.zeros(shapes.COLUMNS)
+    row[: shapes.BASE] = kind, x, y, np.cos(heading), np.sin(heading), size[0] / 2, size[1] / 2
+    return row
 
 
 def _ground_body(ground: HeightField, blocks: F64) -> Body:
@@ -386,15 +367,13 @@ class HeightField:
         return np.asarray(np.where(fu >= fv, lower, upper))
 
 
-def make_terrain(area: Area, relief_m: float, step_m: float, seed: int) -> HeightField:
+def make_terrain(area: Area, relief_m: float, seed: int) -> HeightField:
     """A terrain whose hills span about ``relief_m`` metres, with 0 m at the world's origin."""
-    nx = int(np.ceil(area.size_m[0] / step_m)) + 1
-    ny = int(np.ceil(area.size_m[1] / step_m)) + 1
+    nx, ny = (int(np.ceil(side / TERRAIN_STEP_M)) + 1 for side in area.size_m)
     z = np.empty((ny, nx))
-    parallel_for(_heights, ny, z, area.x0, area.y0, step_m, relief_m, seed)
-    terrain = HeightField(area, step_m, z)
-    zero = terrain.height(np.zeros(1), np.zeros(1))[0]
-    return HeightField(area, step_m, z - zero)
+    parallel_for(_heights, ny, z, area.x0, area.y0, TERRAIN_STEP_M, relief_m, seed)
+    zero = HeightField(area, TERRAIN_STEP_M, z).height(np.zeros(1), np.zeros(1))[0]
+    return HeightField(area, TERRAIN_STEP_M, z - zero)
 
 
 @njit(cache=True, nogil=True)
