@@ -16,6 +16,7 @@ from service.errors import InputError, refusing
 from service.offline.exports import EXPORTERS, kind_of
 from service.packages import needing
 
+OutFile = Annotated[Path | None, typer.Option(help="file to write; default: in the scan folder")]
 Recording = Annotated[
     Path | None,
     typer.Option(help="the flight's video or folder of images; default: as named in scan.json"),
@@ -33,19 +34,14 @@ def export(
     to: Annotated[
         list[str] | None,
         typer.Option(
-            "--to",
             help="what to write, of the list above; may be repeated",
             autocompletion=choices(EXPORTERS),
         ),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="file to write; default: in the scan folder")
-    ] = None,
+    out: OutFile = None,
     voxel_m: Voxel = None,
-    cell_m: Annotated[
-        float | None, typer.Option("--cell-m", help="cell size of dsm, ortho, contours")
-    ] = None,
-    contour_m: Annotated[float, typer.Option("--contour-m", help="contour interval")] = 1.0,
+    cell_m: Annotated[float | None, typer.Option(help="cell size of dsm, ortho, contours")] = None,
+    contour_m: Annotated[float, typer.Option(help="contour interval")] = 1.0,
     strict: Annotated[
         bool, typer.Option("--strict", help="leave the holes of the surface model unknown")
     ] = False,
@@ -117,16 +113,14 @@ def _epoch_ns(seconds: float | None) -> int | None:
 
 def mesh(
     scan_dir: ScanDir,
-    faces: Annotated[int, typer.Option("--faces", min=100, help="triangles at most")] = 400_000,
+    faces: Annotated[int, typer.Option(min=100, help="triangles at most")] = 400_000,
     voxel_m: Voxel = None,
     video: Recording = None,
     stored: StoredImages = False,
     video_epoch: RecordingStart = None,
     tile_points: TilePoints = 20_000_000,
     scheduler: Scheduler = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="file to write; default: mesh.glb in the folder")
-    ] = None,
+    out: OutFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Mesh and texture a scan into one binary glTF file."""
@@ -162,11 +156,9 @@ def mesh(
 def inspect(
     scan_dir: ScanDir,
     keyframe: Annotated[
-        int | None, typer.Option("--keyframe", help="number of the keyframe; default: a middle one")
+        int | None, typer.Option(help="number of the keyframe; default: a middle one")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="PNG to write; default: in the scan folder")
-    ] = None,
+    out: OutFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw raw and rectified frames, anaglyph, disparity, depth and sigma of a keyframe.
@@ -221,13 +213,13 @@ def site(
         str, typer.Argument(help="align or compare", autocompletion=choices(ACTIONS))
     ],
     scans: Annotated[list[Path], typer.Argument(help="scan folders; compare: before and after")],
-    out: Annotated[Path, typer.Option("--out", help="folder of the site")],
+    out: Annotated[Path, typer.Option(help="folder of the site")],
     start: Annotated[
         list[str] | None,
         typer.Option(help="align: SCAN:POINTS.json places a scan without georeference"),
     ] = None,
     cell_m: Annotated[
-        float | None, typer.Option("--cell-m", help="compare: cell size; default: pixel on ground")
+        float | None, typer.Option(help="compare: cell size; default: pixel on ground")
     ] = None,
     bare: Annotated[
         bool, typer.Option("--bare", help="compare: bare ground only, as in `export --to dtm`")

@@ -29,7 +29,7 @@ PAIR = re.compile(r"(-?(?:\d+\.?\d*|\.\d+)):(-?(?:\d+\.?\d*|\.\d+))", re.ASCII)
 class SimulateOptions:
     """Options of ``simulate``, as they are given."""
 
-    out: Annotated[Path, typer.Option("--out", help="Folder for the flight and its truth.")]
+    out: Annotated[Path, typer.Option(help="Folder for the flight and its truth.")]
     seed: Annotated[int, typer.Option(help="Seed of the site and of all random numbers.")] = 1
     duration_s: Annotated[float, typer.Option(help="Length of the video.")] = 30.0
     height_m: Annotated[float, typer.Option(help="Height above the ground at the start.")] = 60.0
