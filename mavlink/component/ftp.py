@@ -10,7 +10,7 @@ import re
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink.wire.dialect import dialect
@@ -150,7 +150,7 @@ class FileServer:
             return [_ack(r, file[r.offset : r.offset + room])]
         end = min(len(file), r.offset + BURST_PACKETS * room)
         return [
-            _ack(r, file[at : min(at + room, end)], k, at, last=at + room >= end)
+            _ack(r, file[at : min(at + room, end)], k, at + room >= end, offset=at)
             for k, at in enumerate(range(r.offset, end, room))
         ]
 
@@ -160,22 +160,16 @@ def _name(r: FtpRequest) -> str:
     return SELECTOR.sub("", path)
 
 
-def _ack(
-    r: FtpRequest,
-    data: bytes,
-    step: int = 0,
-    offset: int | None = None,
-    last: bool = False,
-    session: int | None = None,
-) -> bytes:
-    at = r.offset if offset is None else offset
-    number = r.session if session is None else session
-    head = HEAD.pack(
-        (r.sequence + 1 + step) & 0xFFFF, number, ACK, len(data), r.opcode, int(last), 0, at
-    )
-    return (head + data).ljust(PAYLOAD, b"\0")
+def _ack(r: FtpRequest, data: bytes, step: int = 0, last: bool = False, **changed: int) -> bytes:
+    """The answer; ``changed`` is the session or the offset where it is not the request's."""
+    return _payload(replace(r, **changed), ACK, data, step, last)
 
 
 def _nak(r: FtpRequest, error: int) -> bytes:
-    head = HEAD.pack((r.sequence + 1) & 0xFFFF, r.session, NAK, 1, r.opcode, 0, 0, r.offset)
-    return (head + bytes((error,))).ljust(PAYLOAD, b"\0")
+    return _payload(r, NAK, bytes((error,)))
+
+
+def _payload(r: FtpRequest, code: int, data: bytes, step: int = 0, last: bool = False) -> bytes:
+    sequence = (r.sequence + 1 + step) & 0xFFFF
+    head = HEAD.pack(sequence, r.session, code, len(data), r.opcode, int(last), 0, r.offset)
+    return (head + data).ljust(PAYLOAD, b"\0")

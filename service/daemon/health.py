@@ -46,7 +46,7 @@ class HealthServer:
                 f"health.http {address} cannot be served: {error.strerror}; give another port"
             ) from error
         self.port = int(listener.getsockname()[1])
-        self._server = _Server(listener, _handler(snapshot, is_loopback(host)))
+        self._server = _Server(listener, snapshot, is_loopback(host))
         self._worker = PROCESS.start("health", lambda _: self._server.serve_forever())
 
     def close(self) -> None:
@@ -72,10 +72,11 @@ def _is_own(header: str | None, is_local: bool) -> bool:
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
-    def __init__(self, listener: BoundedListener, handler: type[BaseHTTPRequestHandler]) -> None:
-        super().__init__(listener.getsockname()[:2], handler, bind_and_activate=False)
+    def __init__(self, listener: BoundedListener, snapshot: Snapshot, is_local: bool) -> None:
+        super().__init__(listener.getsockname()[:2], _Handler, bind_and_activate=False)
         self.socket.close()
         self.socket = self._listener = listener
+        self.snapshot, self.is_local = snapshot, is_local
 
     def service_actions(self) -> None:
         """Called twice a second while serving."""
@@ -94,54 +95,52 @@ def metrics_text(snapshot: dict[str, Any], prefix: str = PREFIX) -> str:
     return "\n".join(line for line in lines if line) + "\n"
 
 
-def _handler(snapshot: Snapshot, is_local: bool) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        server_version = "skyrelief"
-        sys_version = ""
-        timeout = 10.0
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    server_version = "skyrelief"
+    sys_version = ""
+    timeout = 10.0
 
-        def do_GET(self) -> None:
-            if not _is_own(self.headers.get("Host"), is_local):
-                self._answer(421, "not a name of this machine\n", "text/plain")
-                return
-            path = self.path.partition("?")[0]
-            if path == "/openapi.json":
-                self._answer(200, DESCRIPTION.read_text(encoding="utf-8"), "application/json")
-                return
-            found = redacted(snapshot())
-            if path == "/healthz":
-                ok = bool(found.get("ok"))
-                body = {"ok": ok, "state": found.get("state"), "fault": found.get("fault")}
-                self._answer(200 if ok else 503, json.dumps(body), "application/json")
-            elif path == "/status":
-                self._answer(200, json.dumps(found), "application/json")
-            elif path == "/metrics":
-                self._answer(200, metrics_text(found), "text/plain; version=0.0.4")
-            else:
-                self._answer(404, "available: /healthz, /status and /metrics\n", "text/plain")
+    def do_GET(self) -> None:
+        if not _is_own(self.headers.get("Host"), self.server.is_local):
+            self._answer(421, "not a name of this machine\n", "text/plain")
+            return
+        path = self.path.partition("?")[0]
+        if path == "/openapi.json":
+            self._answer(200, DESCRIPTION.read_text(encoding="utf-8"), "application/json")
+            return
+        found = redacted(self.server.snapshot())
+        if path == "/healthz":
+            ok = bool(found.get("ok"))
+            body = {"ok": ok, "state": found.get("state"), "fault": found.get("fault")}
+            self._answer(200 if ok else 503, json.dumps(body), "application/json")
+        elif path == "/status":
+            self._answer(200, json.dumps(found), "application/json")
+        elif path == "/metrics":
+            self._answer(200, metrics_text(found), "text/plain; version=0.0.4")
+        else:
+            self._answer(404, "available: /healthz, /status and /metrics\n", "text/plain")
 
-        do_HEAD = do_GET
+    do_HEAD = do_GET
 
-        def _refuse(self) -> None:
-            self.send_response(405)
-            self.send_header("Allow", "GET, HEAD")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-            self.close_connection = True  # a body may follow; it is not read
+    def _refuse(self) -> None:
+        self.send_response(405)
+        self.send_header("Allow", "GET, HEAD")
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+        self.close_connection = True  # a body may follow; it is not read
 
-        do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _refuse
+    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _refuse
 
-        def _answer(self, code: int, text: str, kind: str) -> None:
-            body = text.encode()
-            self.send_response(code)
-            self.send_header("Content-Type", f"{kind}; charset=utf-8")
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(body)
+    def _answer(self, code: int, text: str, kind: str) -> None:
+        body = text.encode()
+        self.send_response(code)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
 
-        def log_message(self, format: str, *args: Any) -> None:
-            log.debug("http: " + format, *args)
-
-    return Handler
+    def log_message(self, format: str, *args: Any) -> None:
+        log.debug("http: " + format, *args)
