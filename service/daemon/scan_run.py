@@ -47,7 +47,7 @@ class ScanRun:
     has_grown: bool = False
     stop: threading.Event = field(default_factory=threading.Event)
     workers: list[Worker] = field(default_factory=list)  # its own, and that of its files
-    is_left: bool = False  # another scan did not wait for its files
+    is_left: bool = False  # its files are being written, and another scan did not wait for them
     work: Work | None = None  # of a command that waits for its end
     warnings_reported: int = 0  # camera warnings reported so far
     _photos: set[int] = field(default_factory=set)  # times of the frames reported as photos

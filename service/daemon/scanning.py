@@ -121,11 +121,11 @@ class Scanning:
             effects = self.life.handle(event, self._clock_s())
             for effect in effects:
                 self._perform(effect)
-            run = self.run
+            scan = self.scan
             if event is Event.GROWN:
                 self.is_warm = True
-        if Effect.CLOSE in effects and run is not None and run.scan is not None:
-            run.scan.source.close()  # wakes it where the camera is dead; may take long
+        if Effect.CLOSE in effects and scan is not None:
+            scan.source.close()  # wakes it where the camera is dead; may take long
         return before
 
     def _perform(self, effect: Effect) -> None:
@@ -441,6 +441,8 @@ class Scanning:
                 if fault:
                     text = f"Scan {folder.name} is stored, its files are not written: {fault}"
                     self.vehicle.statustext(text, WARNING)
+                with self._lock:
+                    run.is_left = False
                 run.finish(fault)
 
         run.workers.append(self._workers.start("files", write))
@@ -448,8 +450,8 @@ class Scanning:
             if self.life.state.is_wanted:
                 self.link.end_scan(self.config, is_next_wanted=True)
                 with self._lock:
-                    run.is_left = not is_written.is_set()
-                if run.is_left:
+                    is_left = run.is_left = not is_written.is_set()
+                if is_left:
                     return
         is_last = self.life.state in (State.ENDING, State.ENDED)
         self.link.end_scan(self.config, is_last=is_last)
