@@ -45,7 +45,8 @@ def umeyama(
     ``is_level`` turns about z alone. None for fewer than three points or points in a line, which
     leave a turn open. Umeyama 1991, doi:10.1109/34.88573.
     """
-    w = np.full(len(source), 1.0 / len(source)) if weight is None else weight / weight.sum()
+    w = np.ones(len(source)) if weight is None else weight
+    w = w / w.sum()
     ms, mt = w @ source, w @ target
     a, b = source - ms, target - mt
     cross = (b * w[:, None]).T @ a

@@ -307,13 +307,9 @@ class VirtualStereoCamera:
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         relative = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
         frame = replace(
-            image,
-            image=None,
-            pyramid=(),
-            mask=None,
-            relative=relative,
+            image, image=None, pyramid=(), mask=None, relative=relative,
             row_motion=tracked.row_motion,
-        )
+        )  # fmt: skip
         self._tracked.append((image.time_ns, relative))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)
@@ -375,6 +371,9 @@ class VirtualStereoCamera:
         assert relative is not None and image is not None
         points = se3.transform(se3.inverse(relative.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
+        # Of the motion since the view given before.
+        since = self._given[-1].keyframe.seq if self._given and self._given[-1].keyframe else -1
+        keys = [k for k in self._odometry.keyframes if since < k.seq <= view.keyframe.seq]
         return StereoView(
             view.time_ns,
             prior,
@@ -382,7 +381,7 @@ class VirtualStereoCamera:
             tuple(self._posed(partner, in_odom) for partner in partners),
             relative,
             points,
-            self._step_covariance(view),
+            step_covariance(keys or [view.keyframe], se3.inverse(view.T_odom_camera)),
             {a.seq: a.T_odom_camera for a in self._given if a.segment == view.segment},
             self._rows_share(view, partners, points),
         )
@@ -409,14 +408,6 @@ class VirtualStereoCamera:
             of_readout = float(np.median(shares))
         of_turns = turn_shares(rows, pairs, seen, self._K, view.gray.shape[::-1])
         return np.asarray(np.hypot(of_readout, of_turns), np.float32)
-
-    def _step_covariance(self, view: UndistortedFrame) -> F64:
-        """(6, 6) of the motion since the view given before."""
-        last = self._given[-1].keyframe if self._given else None
-        since = -1 if last is None else last.seq
-        T_camera_odom = se3.inverse(view.T_odom_camera)
-        keys = [k for k in self._odometry.keyframes if since < k.seq <= view.keyframe.seq]
-        return step_covariance(keys or [view.keyframe], T_camera_odom)
 
     def _posed(self, view: UndistortedFrame, points: F64) -> PosedImage:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
