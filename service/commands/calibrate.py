@@ -5,16 +5,12 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from service.commands import AsJson, showing
 from service.errors import InputError, refusing
-
-if TYPE_CHECKING:
-    from recon.calibration.board import Board, Calibration
-    from service.cameras.board_images import BoardSet
 
 
 def calibrate(
@@ -32,13 +28,17 @@ def calibrate(
     """
     import cv2
 
-    from recon.calibration.board import MIN_VIEWS, CalibrationConfig
+    from recon.calibration.board import MIN_VIEWS, Board, CalibrationConfig
     from recon.calibration.board import calibrate as fit
     from service.cameras.board_images import draw_coverage, find_boards
     from service.cameras.camera_file import save_camera
     from service.scans.writing import check_writable, write_whole
 
-    board = _board(pattern, square_m)
+    corners = re.fullmatch(r"(\d{1,3})x(\d{1,3})", pattern.strip())
+    if corners is None:
+        raise InputError(f"--pattern {pattern!r}: expected inner corners such as 9x6")
+    with refusing(f"--pattern {pattern} --square-m {square_m:g}"):
+        board = Board(int(corners[1]), int(corners[2]), square_m)
     check_writable(out)
     with showing("calibrate") as progress:
         boards = find_boards(sources, board, progress)
@@ -52,7 +52,19 @@ def calibrate(
         result = fit(boards.views, board, boards.size_px, CalibrationConfig(tangential))
     if result is None:
         raise InputError("no camera fits these views; take the board from different angles")
-    record = _record(result, boards, board)
+    record = {
+        "rms_px": round(result.rms_px, 4),
+        "pattern": f"{board.columns}x{board.rows}",
+        "square_m": board.square_m,
+        "sigma_focal_px": round(result.sigma_focal_px, 4),
+        "coverage": round(result.coverage, 3),
+        "views": {
+            view: round(float(rms), 4)
+            for view, rms in zip(result.used, result.view_rms_px, strict=True)
+        },
+        "not_used": dict(boards.missed + result.rejected),
+        "warnings": list(result.warnings),
+    }
     try:
         save_camera(out, result.camera, name, {"calibration": record})
     except ValueError as error:
@@ -66,33 +78,6 @@ def calibrate(
         "distortion": result.camera.distortion.tolist(),
     }
     print(json.dumps(report) if as_json else result_text(report))
-
-
-def _board(pattern: str, square_m: float) -> Board:
-    from recon.calibration.board import Board
-
-    found = re.match(r"^(\d{1,3})x(\d{1,3})$", pattern.strip())
-    if found is None:
-        raise InputError(f"--pattern {pattern!r}: expected inner corners such as 9x6")
-    with refusing(f"--pattern {pattern} --square-m {square_m:g}"):
-        return Board(int(found[1]), int(found[2]), square_m)
-
-
-def _record(result: Calibration, boards: BoardSet, board: Board) -> dict[str, Any]:
-    """A calibration's results, in plain values."""
-    return {
-        "rms_px": round(result.rms_px, 4),
-        "pattern": f"{board.columns}x{board.rows}",
-        "square_m": board.square_m,
-        "sigma_focal_px": round(result.sigma_focal_px, 4),
-        "coverage": round(result.coverage, 3),
-        "views": {
-            view: round(float(rms), 4)
-            for view, rms in zip(result.used, result.view_rms_px, strict=True)
-        },
-        "not_used": dict(boards.missed + result.rejected),
-        "warnings": list(result.warnings),
-    }
 
 
 def result_text(report: dict[str, Any]) -> str:

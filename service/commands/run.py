@@ -31,8 +31,11 @@ def run(config: ConfigFile = None, set_: Overrides = None) -> None:
 
     one_pool()  # before there are threads
     chosen, fault = _configuration(config, set_ or [])
-    flight = _simulated(chosen)
-    if flight is not None:
+    flight = None
+    if chosen.camera.source.startswith("sim:"):
+        from service.daemon.simulated import SimulatedFlight
+
+        flight = SimulatedFlight(chosen.camera.source)
         chosen = flight.configured(chosen)
         flight.start()
     first = _first_beats(chosen)
@@ -83,15 +86,6 @@ def _first_beats(config: Config) -> FirstBeats | None:
         return None  # said by the check of the whole configuration
     first.start()
     return first
-
-
-def _simulated(config: Config) -> SimulatedFlight | None:
-    """The flight of ``camera.source = "sim:"``."""
-    if not config.camera.source.startswith("sim:"):
-        return None
-    from service.daemon.simulated import SimulatedFlight
-
-    return SimulatedFlight(config.camera.source)
 
 
 def _reload(

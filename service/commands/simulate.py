@@ -8,7 +8,6 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +17,6 @@ from service.commands import AsJson, parse_size, record_of, showing, with_option
 from service.errors import InputError, refusing
 
 if TYPE_CHECKING:
-    from service.progress import Progress
     from service.sim.recording import SimulationOptions
 
 VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
@@ -160,7 +158,12 @@ def simulate(given: SimulateOptions) -> None:
         progress("laying out the site")
         simulation = recording.prepare(options)
     with showing("simulate") as progress, filling_folder(given.out) as part:
-        result = recording.write(simulation, part, partial(_frames, progress))
+
+        def rendered(done: int, total: int) -> None:
+            progress.share = done / total
+            progress("rendering")
+
+        result = recording.write(simulation, part, rendered)
     if not given.live:
         _report(given.out, result, time.monotonic() - started, given.as_json)
         return
@@ -190,11 +193,6 @@ def _pair(text: str, option: str) -> tuple[float, float]:
     if found is None:
         raise InputError(f"{option} {text!r}: expected two numbers with a colon, such as 10:2.5")
     return float(found[1]), float(found[2])
-
-
-def _frames(progress: Progress, done: int, total: int) -> None:
-    progress.share = done / total
-    progress("rendering")
 
 
 def _report(out: Path, result: dict[str, Any], seconds: float, as_json: bool) -> None:
