@@ -16,7 +16,6 @@ import numpy as np
 
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import LatencyEstimate
-from recon import se3
 from recon.calibration.global_bundle import Knowledge
 from recon.calibration.joint_adjustment import JointAdjustment, Turning, adjust_jointly
 from recon.calibration.tracks import pieces
@@ -151,13 +150,16 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
     priors = [prior for _, prior in known]
     H, W = known[0][0].gray.shape
     camera = scaled(full, (W, H))
-    poses = np.array([_pose(prior) for prior in priors])
+    poses = np.tile(np.eye(4), (len(priors), 1, 1))
+    poses[:, :3, :3] = np.array([p.R_world_camera for p in priors])
+    poses[:, :3, 3] = np.array([p.position_m for p in priors])
     ground_m = float(np.median(poses[:, 2, 3] - [prior.agl_m or 0.0 for prior in priors]))
     images = {k: still.gray for k, (still, _) in enumerate(known)}
     views = sightings(images, camera, poses, ground_m)
     found = adjust_jointly(
-        camera, views.poses, views.seen, _knowledge(priors, int(views.seen.landmark.max()) + 1),
-        _turning(priors, history), seeks,
+        camera, views.poses, views.seen,
+        _knowledge(priors, poses, int(views.seen.landmark.max()) + 1),
+        _turning(priors, poses, history), seeks,
     )  # fmt: skip
     piece = pieces(found.seen, len(known))
     tied = np.flatnonzero(piece == np.bincount(piece).argmax())
@@ -190,32 +192,23 @@ def is_torn(poses: F64, times_s: F64, priors: Sequence[PosePrior]) -> bool:
     return bool((apart_m > reach_m).any())
 
 
-def _pose(prior: PosePrior) -> F64:
-    """(4, 4) T_world_camera."""
-    assert prior.R_world_camera is not None and prior.position_m is not None
-    return se3.compose(prior.R_world_camera, prior.position_m)
-
-
-def _knowledge(priors: Sequence[PosePrior], points: int) -> Knowledge:
+def _knowledge(priors: Sequence[PosePrior], poses: F64, points: int) -> Knowledge:
     """Fixes and attitudes of the log."""
     out = Knowledge.none(len(priors), points)
-    for k, p in enumerate(priors):
-        assert p.position_m is not None and p.sigma_position_m is not None
-        assert p.R_world_camera is not None
-        out.fixes[k], out.sigma_fixes[k] = p.position_m, FIX_SIGMAS * p.sigma_position_m
-        out.attitudes[k] = p.R_world_camera
-        out.sigma_attitudes[k] = p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad
+    out.fixes[:], out.attitudes[:] = poses[:, :3, 3], poses[:, :3, :3]
+    out.sigma_fixes[:] = FIX_SIGMAS * np.array([p.sigma_position_m for p in priors])
+    sigmas = [(p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad) for p in priors]
+    out.sigma_attitudes[:] = np.array(sigmas)
     return out
 
 
-def _turning(priors: Sequence[PosePrior], history: VehicleHistory) -> Turning:
+def _turning(priors: Sequence[PosePrior], poses: F64, history: VehicleHistory) -> Turning:
     """How the camera moved at each exposure, by the log."""
-    rates = np.zeros((len(priors), 6))
-    for k, p in enumerate(priors):
-        assert p.turn_rad_s is not None and p.R_world_camera is not None
-        rates[k, :3], rates[k, 3:] = -p.turn_rad_s, -p.R_world_camera.T @ p.velocity_m_s
+    turns = np.array([p.turn_rad_s for p in priors])
+    speeds = np.array([p.velocity_m_s for p in priors])
+    in_camera = np.einsum("nji,nj->ni", poses[:, :3, :3], speeds)
     gap_s = 1e-9 * float(np.median(np.diff([t for _, t in history.attitudes()])))
-    return Turning(rates, turn_sigma_rad_s(gap_s))
+    return Turning(-np.column_stack([turns, in_camera]), turn_sigma_rad_s(gap_s))
 
 
 def _track(found: JointAdjustment, views: dict[int, int], lens: Camera) -> AdjustedTrack:
