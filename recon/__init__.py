@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
     from recon.pipeline.mapper import Mapper, MapperConfig
-    from recon.types import Camera, Frame, PointCloud, Pose, PosePrior
+    from recon.tracking.frame import Frame
+    from recon.types import Camera, PointCloud, Pose, PosePrior
 
 __all__ = [
     "Camera",

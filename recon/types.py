@@ -106,16 +106,6 @@ class PosePrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """One image of the camera, still distorted, and the telemetry at its instant."""
-
-    image: U8  # (H, W, 3) BGR
-    time_ns: int  # mid-exposure; companion monotonic live, unix nanoseconds in a replay
-    seq: int
-    prior: PosePrior = PosePrior()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Pose:
     """A camera pose with its uncertainty and its sources."""
 

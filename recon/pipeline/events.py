@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from recon.tracking.frame import RelativePose
-from recon.tracking.odometry import Tracked
+from recon.tracking.frame import Frame
 from recon.types import Array, Keyframe, Pose
 
 
@@ -14,11 +13,8 @@ from recon.types import Array, Keyframe, Pose
 class FramePosed:
     """A frame went through tracking. One that was lost comes again where the next one places it."""
 
-    seq: int
-    time_ns: int
-    tracked: Tracked
+    frame: Frame  # without its images; ``relative`` gives its pose again, as known later
     pose: Pose | None = None  # in the world; by telemetry alone when vision fails
-    relative: RelativePose | None = None  # to its keyframe: gives its pose again, as known later
     is_view: bool = False  # the frame takes part in stereo and may become a keyframe
 
 

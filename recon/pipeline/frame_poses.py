@@ -12,8 +12,7 @@ from recon import se3
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.posegraph.pose_priors import dead_reckoned
 from recon.poses import carried
-from recon.tracking.frame import RelativePose
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.frame import Frame, RelativePose, Tracking
 from recon.types import F64, Pose, PosePrior
 
 
@@ -60,9 +59,12 @@ class FramePoses:
         """Place frames by the whole graph from now on."""
         self._newest = None
 
-    def place(self, prior: PosePrior, frame: RelativePose) -> Pose:
-        """A new frame in the world."""
-        pose = self.pose(frame, self._fallback(prior, frame))
+    def place(self, frame: Frame) -> Pose | None:
+        """A new frame in the world, by vision or else by telemetry; None where neither tells."""
+        prior, relative = frame.prior, frame.relative
+        if relative is None:
+            return self._by_telemetry(prior) if frame.state is Tracking.LOST else None
+        pose = self.pose(relative, self._fallback(prior, relative))
         self._seen = prior, pose, frame.segment
         return pose
 
@@ -119,16 +121,14 @@ class FramePoses:
         about = se3.about(-pose.T_world_camera[:3, 3], spread)
         return replace(pose, covariance=pose.covariance + about)
 
-    def by_telemetry(self, prior: PosePrior, tracked: Tracked) -> Pose | None:
+    def _by_telemetry(self, prior: PosePrior) -> Pose | None:
         """A lost frame where telemetry alone says the camera is; None without attitude, heading
         or position.
 
         Telemetry's error when vision was lost is subtracted, so that the track continues.
         """
         R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
-        if tracked.state is not Tracking.LOST or R is None or position is None or sigma is None:
-            return None
-        if prior.sigma_yaw_rad > 1.0:
+        if R is None or position is None or sigma is None or prior.sigma_yaw_rad > 1.0:
             return None
         T = se3.compose(R, position)
         if self._seen is not None:

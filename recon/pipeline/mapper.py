@@ -40,9 +40,9 @@ from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.adjusted_track import AdjustedTrack
-from recon.tracking.frame import RelativePose, UndistortedFrame
-from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.types import Array, Camera, Frame, Keyframe, PointCloud, Pose, PosePrior
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.odometry import Odometry
+from recon.types import Array, Camera, Keyframe, PointCloud, Pose, PosePrior
 
 __all__ = ["Mapper", "MapperConfig"]
 
@@ -152,7 +152,6 @@ class Mapper:
         )
         self.exposure = ExposureCompensation()
         self.frames = FramePoses(self.keyframes, self.is_settled)
-        self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
         self._ready = set[int]()  # numbers of all keyframes that are given out
         self._worker = worker(self.reconstruct)
@@ -172,8 +171,8 @@ class Mapper:
         frames_per_step = self.views.selection.frames_per_step
         if not self.odometry.can_skip(time_ns, prior, frames_per_step):
             return ()  # frames are followed as fast as images move
-        skipped = FramePosed(seq, time_ns, Tracked(Tracking.SKIPPED, self.odometry.segment))
-        return (*self._finished(), skipped)
+        skipped = Frame(NO_IMAGE, time_ns, seq, prior, segment=self.odometry.segment)
+        return (*self._finished(), FramePosed(skipped))
 
     def track(self, frame: Frame) -> tuple[Event, ...]:
         """One frame: where the camera is, and which views have their partners by now.
@@ -181,39 +180,38 @@ class Mapper:
         Raises ValueError when the image is not of the camera model's size.
         """
         undistorted = self.undistort(frame)  # section 2.1
-        tracked = self.locate(undistorted)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
-        late = self._late(undistorted, tracked)
-        relative, is_view = self.views.take(undistorted, tracked)  # virtual stereo, 2.3
-        if relative is None:
-            done = tuple(self._finished())  # while vision is lost, too
-            pose = self.frames.by_telemetry(undistorted.prior, tracked)
-            return (*done, FramePosed(frame.seq, frame.time_ns, tracked, pose))
-        for view in self.views.ready():
-            self._worker.offer(view)  # to be reconstructed
-        if self._first_stereo is not None and self._worker.is_free:
-            first = self.views.first()
-            if first is not None:
-                self._worker.offer(first)
-        done = tuple(self._finished())
-        pose = self.frames.place(frame.prior, relative)
-        posed = FramePosed(frame.seq, frame.time_ns, tracked, pose, relative, is_view)
-        return (*late, *done, posed)
+        *late, tracked = self.locate(undistorted)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
+        placed = [self._posed(still, self.views.take(still)) for still in late]
+        is_view = self.views.take(tracked)  # virtual stereo, 2.3
+        if tracked.relative is not None:
+            for view in self.views.ready():
+                self._worker.offer(view)  # to be reconstructed
+            if self._first_stereo is not None and self._worker.is_free:
+                first = self.views.first()
+                if first is not None:
+                    self._worker.offer(first)
+        done = tuple(self._finished())  # while vision is lost, too
+        return (*placed, *done, self._posed(tracked, is_view))
 
-    def locate(self, frame: UndistortedFrame) -> Tracked:
-        """The frame's pose by the odometry, or why there is none."""
+    def _posed(self, frame: Frame, is_view: bool) -> FramePosed:
+        plain = replace(frame, image=NO_IMAGE, gray=NO_IMAGE, pyramid=(), mask=None)
+        return FramePosed(plain, self.frames.place(frame), is_view)
+
+    def locate(self, frame: Frame) -> list[Frame]:
+        """The frame with its pose by the odometry, or why there is none; before it the last one,
+        where that was lost until now."""
         with self._timing("track"):
-            tracked = self.odometry.track(frame)
-        if tracked.before is not None:
-            self.refused -= Counter([tracked.before.reason])
+            *late, tracked = self.odometry.track(frame)
+        self.refused -= Counter(still.reason for still in late)
         if tracked.state is Tracking.WAITING:
             self._waiting[tracked.reason] += 1
-        elif tracked.T_odom_camera is None:
+        elif tracked.relative is None:
             self.refused[tracked.reason] += 1
         else:
             if tracked.state is Tracking.STARTED:  # the segment before never began
                 self.refused.update(self._waiting)
             self._waiting.clear()
-        return tracked
+        return [*late, tracked]
 
     def is_settled(self, frame: RelativePose) -> bool:
         """True when the odometry no longer adjusts the frame's reference keyframe."""
@@ -221,16 +219,6 @@ class Mapper:
         if key is None or key.segment != self.odometry.segment or not window:
             return True
         return key.seq < window[0].seq
-
-    def _late(self, frame: UndistortedFrame, tracked: Tracked) -> tuple[Event, ...]:
-        """The frame before, lost until this one came: it begins this one's segment."""
-        before, self._lost = self._lost, frame if tracked.state is Tracking.LOST else None
-        if before is None or tracked.before is None:
-            return ()
-        relative, is_view = self.views.take(before, tracked.before)
-        assert relative is not None
-        pose = self.frames.place(before.prior, relative)
-        return (FramePosed(before.seq, before.time_ns, tracked.before, pose, relative, is_view),)
 
     def reconstruct(self, view: StereoView) -> Reconstructed:
         """One view: its depth from all its partners, its pose, and its new surface."""

@@ -21,7 +21,7 @@ from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import PairDepth, carry, fuse, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
-from recon.tracking.frame import UndistortedFrame
+from recon.tracking.frame import Frame
 from recon.tracking.matching import build_pyramid
 from recon.types import (
     F32,
@@ -32,7 +32,6 @@ from recon.types import (
     Camera,
     DepthMap,
     DisparityMap,
-    Frame,
     Keyframe,
     PolarPair,
     Pose,
@@ -60,7 +59,7 @@ class Undistort:
         self._seen = mask > 0
         self._mask = None if mask.all() else mask
 
-    def __call__(self, frame: Frame) -> UndistortedFrame:
+    def __call__(self, frame: Frame) -> Frame:
         """Raises ValueError when the image is not of the camera model's size."""
         with self._timing("undistort"):
             image = _resized(frame.image, self.camera.size_px)
@@ -71,10 +70,10 @@ class Undistort:
                 small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
             small = stretch(small, self._seen)
             is_blurred = self._blur.blurred(small)
-            pyramid = build_pyramid(small)
-            return UndistortedFrame(
-                frame.seq, frame.time_ns, frame.prior, image, gray, pyramid, self._mask, is_blurred
-            )
+            return replace(
+                frame, image=image, gray=gray, pyramid=build_pyramid(small), mask=self._mask,
+                is_blurred=is_blurred,
+            )  # fmt: skip
 
 
 class DenseStereo:

@@ -21,9 +21,8 @@ from recon.rolling_shutter import NEAR_S, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.posed_image import PosedImage
 from recon.tracking.adjusted_track import AnyTrack
-from recon.tracking.frame import RelativePose, UndistortedFrame
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
 from recon.tracking.keyframe_window import landmark_points, median_depth, step_covariance
-from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F32, F64, U8, PosePrior
 
@@ -112,11 +111,11 @@ class ViewSelection:
         self.max_partners = partners
         self.takes_next = False  # the next frame with a pose, whatever the baseline asks for
         self._all_known = all_known
-        self._kept = deque[UndistortedFrame](maxlen=KNOWN_KEPT if all_known else KEPT)
-        self._between = deque[UndistortedFrame](maxlen=8 * partners if partners > KEPT - 2 else 0)
-        self._recent = deque[UndistortedFrame](maxlen=6)  # a quarter of a step apart
+        self._kept = deque[Frame](maxlen=KNOWN_KEPT if all_known else KEPT)
+        self._between = deque[Frame](maxlen=8 * partners if partners > KEPT - 2 else 0)
+        self._recent = deque[Frame](maxlen=6)  # a quarter of a step apart
         # A last view, and its partner.
-        self._extra: tuple[UndistortedFrame, list[UndistortedFrame]] | None = None
+        self._extra: tuple[Frame, list[Frame]] | None = None
         self._views_of: Counter[int] = Counter()  # views by segment, kept or not
 
     @property
@@ -135,9 +134,9 @@ class ViewSelection:
         """The shortest baseline that stereo should accept: an operator's choice is kept."""
         return 0.03 if self._is_auto else 0.002
 
-    def offer(self, frame: UndistortedFrame, tracked: Tracked) -> bool:
+    def offer(self, frame: Frame) -> bool:
         """True when the frame is to be a view."""
-        if self.takes_next or self._wants(frame.seq, tracked):
+        if self.takes_next or self._wants(frame):
             self.takes_next = False
             self._keep(frame)
             return True
@@ -147,7 +146,7 @@ class ViewSelection:
             self._recent.append(frame)
         return False
 
-    def end_stretch(self, frame: UndistortedFrame | None) -> bool:
+    def end_stretch(self, frame: Frame | None) -> bool:
         """True when the last frame of a stretch must be a view: it shows more than the last one.
         ``frame`` is that frame unless it is a view already. The newest ground is not in the view
         before; a frame between the two becomes its partner.
@@ -168,7 +167,7 @@ class ViewSelection:
         self._extra = (last, near[:1])
         return is_view
 
-    def shows_first(self, frame: UndistortedFrame, view: UndistortedFrame) -> bool:
+    def shows_first(self, frame: Frame, view: Frame) -> bool:
         """True when the frame can be the only partner of the newest view."""
         step = self._step(view.segment)
         if step is None or frame.segment != view.segment or not self.confirmed(view):
@@ -181,7 +180,7 @@ class ViewSelection:
         same = [v for v in self._kept if v.segment == segment]
         return _apart(same[-1], same[-2]) if self._is_auto and len(same) >= 2 else None
 
-    def _moved_on(self, frame: UndistortedFrame) -> bool:
+    def _moved_on(self, frame: Frame) -> bool:
         """True a quarter of a step after the last frame that was remembered."""
         step = self._step(frame.segment)
         if step is None:
@@ -189,24 +188,22 @@ class ViewSelection:
         last = max([self._kept[-1], *self._recent], key=lambda v: v.seq)
         return last.segment == frame.segment and _apart(frame, last) > 0.25 * step
 
-    def _keep(self, view: UndistortedFrame) -> None:
+    def _keep(self, view: Frame) -> None:
         self._kept.append(view)
         self._views_of[view.segment] += 1
 
-    def _wants(self, seq: int, tracked: Tracked) -> bool:
-        if tracked.state is Tracking.STARTED or not self._kept:
-            return tracked.state in (Tracking.STARTED, Tracking.KEYFRAME)
+    def _wants(self, frame: Frame) -> bool:
+        if frame.state is Tracking.STARTED or not self._kept:
+            return frame.state in (Tracking.STARTED, Tracking.KEYFRAME)
         last = self._kept[-1]
         amount = self.baseline.amount
-        if self._is_auto or last.segment != tracked.segment:
-            return tracked.state is Tracking.KEYFRAME
+        if self._is_auto or last.segment != frame.segment:
+            return frame.state is Tracking.KEYFRAME
         if self.baseline.mode == "frames":
-            return seq - last.seq >= frames_apart(int(amount), self.baseline.every)
-        assert tracked.T_odom_camera is not None
-        moved = tracked.T_odom_camera[:3, 3] - last.T_odom_camera[:3, 3]
-        return bool(np.linalg.norm(moved) >= amount)
+            return frame.seq - last.seq >= frames_apart(int(amount), self.baseline.every)
+        return _apart(frame, last) >= amount
 
-    def ready(self, view: UndistortedFrame) -> bool:
+    def ready(self, view: Frame) -> bool:
         """True when the view has two neighbours to pair with, or its segment is over."""
         if not self._kept or self._kept[-1] is view:
             return False
@@ -220,7 +217,7 @@ class ViewSelection:
             return sum(v.seq > view.seq for v in self._kept) >= AHEAD
         return self.confirmed(view)
 
-    def confirmed(self, view: UndistortedFrame) -> bool:
+    def confirmed(self, view: Frame) -> bool:
         """False for a stretch of two views: no other view can contradict a single pair.
 
         Clouds in the sky or a false first motion would otherwise become surface. A baseline
@@ -228,7 +225,7 @@ class ViewSelection:
         """
         return not self._is_auto or self._views_of[view.segment] >= 3
 
-    def partners(self, view: UndistortedFrame) -> list[UndistortedFrame]:
+    def partners(self, view: Frame) -> list[Frame]:
         """The views to pair it with, the best first.
 
         Automatic: those nearest to the wanted base-to-height, from both sides; a fixed
@@ -256,13 +253,13 @@ class ViewSelection:
         return _evenly([v for v in others if near <= _apart(v, view) <= far], self.max_partners)
 
 
-def _evenly(views: list[UndistortedFrame], count: int) -> list[UndistortedFrame]:
+def _evenly(views: list[Frame], count: int) -> list[Frame]:
     """At most ``count`` of the views, evenly spread over their order."""
     picked = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
     return [views[i] for i in picked] if views else []
 
 
-def _apart(a: UndistortedFrame, b: UndistortedFrame) -> float:
+def _apart(a: Frame, b: Frame) -> float:
     return float(np.linalg.norm(a.T_odom_camera[:3, 3] - b.T_odom_camera[:3, 3]))
 
 
@@ -289,44 +286,38 @@ class VirtualStereoCamera:
         self._odometry, self._K, self._refused = odometry, undistorter.camera.K, refused
         self._segment = odometry.segment
         self._fixes = FixAverage()
-        self._waiting: deque[tuple[UndistortedFrame, U8 | None, PosePrior]] = deque()
+        self._waiting: deque[tuple[Frame, U8, PosePrior]] = deque()
         self._given: deque[RelativePose] = deque(maxlen=8)
         self._first = -1  # number of the newest view that was given with its first partner
         # The last tracked frame, unless it is a view, and its image.
-        self._latest: tuple[UndistortedFrame, U8 | None] | None = None
+        self._latest: tuple[Frame, U8] | None = None
         self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
 
-    def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[RelativePose | None, bool]:
-        """The frame relative to its keyframe, None without a pose, and whether it is a view."""
+    def take(self, tracked: Frame) -> bool:
+        """Whether the next frame becomes a view."""
         if tracked.segment != self._segment:
             self.end_stretch()
             self._segment = tracked.segment
-        if tracked.T_odom_camera is None:
-            return None, False
-        key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
-        T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
-        relative = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
-        frame = replace(
-            image, image=None, pyramid=(), mask=None, relative=relative,
-            row_motion=tracked.row_motion,
-        )  # fmt: skip
-        self._tracked.append((image.time_ns, relative))
-        is_view = self.selection.offer(frame, tracked)
-        self._fixes.take(tracked.T_odom_camera, image.prior)
+        if tracked.relative is None:
+            return False
+        frame = replace(tracked, image=NO_IMAGE, pyramid=(), mask=None)
+        self._tracked.append((frame.time_ns, tracked.relative))
+        is_view = self.selection.offer(frame)
+        self._fixes.take(frame.T_odom_camera, frame.prior)
         if is_view:
-            self._wait(frame, image.image)
-        self._latest = None if is_view else (frame, image.image)
-        return relative, is_view
+            self._wait(frame, tracked.image)
+        self._latest = None if is_view else (frame, tracked.image)
+        return is_view
 
     def end_stretch(self) -> None:
         """Make a view of a stretch's last frame: only it shows what the camera saw last."""
-        frame, image = self._latest or (None, None)
-        if self.selection.end_stretch(frame) and frame is not None:
-            self._wait(frame, image)
+        frame = None if self._latest is None else self._latest[0]
+        if self.selection.end_stretch(frame) and self._latest is not None:
+            self._wait(*self._latest)
         self._fixes.forget()
         self._latest = None
 
-    def _wait(self, view: UndistortedFrame, image: U8 | None) -> None:
+    def _wait(self, view: Frame, image: U8) -> None:
         """Keep a view until its partners are there; all fixes since the last one are its own."""
         self._waiting.append((view, image, self._fixes.given(view.T_odom_camera, view.prior)))
 
@@ -353,7 +344,7 @@ class VirtualStereoCamera:
         self._first = view.seq
         return replace(self._stereo_view(view, image, prior, [partner]), is_first_depth=True)
 
-    def _is_ready(self, view: UndistortedFrame) -> bool:
+    def _is_ready(self, view: Frame) -> bool:
         """True when its partners are there, and the images could show the readout."""
         search, newest = self._odometry.readout, self._waiting[-1][0].row_motion
         shows = search is not None and search.is_open and newest.is_measured
@@ -361,14 +352,14 @@ class VirtualStereoCamera:
 
     def _stereo_view(
         self,
-        view: UndistortedFrame,
-        image: U8 | None,
+        view: Frame,
+        image: U8,
         prior: PosePrior,
-        partners: list[UndistortedFrame],
+        partners: list[Frame],
     ) -> StereoView:
         """The view with its ``image``, which is without distortion from now on."""
         relative, points = view.relative, landmark_points(view.keyframe)
-        assert relative is not None and image is not None
+        assert relative is not None
         points = se3.transform(se3.inverse(relative.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         # Of the motion since the view given before.
@@ -386,9 +377,7 @@ class VirtualStereoCamera:
             self._rows_share(view, partners, points),
         )
 
-    def _rows_share(
-        self, view: UndistortedFrame, partners: list[UndistortedFrame], points: F64
-    ) -> F32:
+    def _rows_share(self, view: Frame, partners: list[Frame], points: F64) -> F32:
         """(n, m) sigma of depth over depth by what is not known of readout and turns.
 
         ``points`` (N, 3) of the view's camera are the ground.
@@ -409,7 +398,7 @@ class VirtualStereoCamera:
         of_turns = turn_shares(rows, pairs, seen, self._K, view.gray.shape[::-1])
         return np.asarray(np.hypot(of_readout, of_turns), np.float32)
 
-    def _posed(self, view: UndistortedFrame, points: F64) -> PosedImage:
+    def _posed(self, view: Frame, points: F64) -> PosedImage:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
         posed = PosedImage(
             None, view.gray, self._K, view.T_odom_camera, self._undistorter.valid,
@@ -422,7 +411,7 @@ class VirtualStereoCamera:
         scene = inverse_depth_plane(ground[ground[:, 2] > 0])
         return replace(posed, rows=rows.now(), scene=scene)
 
-    def _blur_px(self, view: UndistortedFrame, points: F64) -> F64 | None:
+    def _blur_px(self, view: Frame, points: F64) -> F64 | None:
         """(2,) px by which the middle of the image moved during the exposure, by the poses of the
         frames before and after; None where images are sharp or those frames are too far away."""
         exposure_s = self._odometry.exposure.shown_s

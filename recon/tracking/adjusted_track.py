@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.focal_watch import FocalWatch
-from recon.tracking.frame import UndistortedFrame
+from recon.tracking.frame import Frame, RelativePose, Tracking
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.motion_blur import ExposureWatch
-from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutEstimate, ReadoutSearch
 from recon.types import F64, I64, Camera, PosePrior
 
@@ -61,11 +61,12 @@ class AdjustedTrack:
     def needs_turn(self, time_ns: int) -> bool:
         return False
 
-    def track(self, frame: UndistortedFrame) -> Tracked:
+    def track(self, frame: Frame) -> list[Frame]:
         seq, time_ns, prior = frame.seq, frame.time_ns, frame.prior
         still = self._stills.get(seq)
         if still is None:
-            return Tracked(Tracking.LOST, self.segment, reason="not tied to other stills")
+            reason = "not tied to other stills"
+            return [replace(frame, state=Tracking.LOST, segment=self.segment, reason=reason)]
         state = Tracking.KEYFRAME if self.keyframes else Tracking.STARTED
         self.segment = 0
         T_camera_odom = se3.inverse(still.T_odom_camera)
@@ -80,7 +81,9 @@ class AdjustedTrack:
             np.zeros((len(still.landmark), 2)), still.landmark, self._landmarks, row_motion,
         )  # fmt: skip
         self.keyframes = [*self.keyframes[1 - KEPT :], key]
-        return Tracked(state, 0, still.T_odom_camera, len(still.landmark), row_motion=row_motion)
+        relative = RelativePose(seq, 0, se3.inverse(key.T_odom_camera) @ still.T_odom_camera, key)
+        found = replace(frame, state=state, segment=0, relative=relative, row_motion=row_motion)
+        return [replace(found, tracks=len(still.landmark))]
 
 
 AnyTrack = Odometry | AdjustedTrack

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 
@@ -10,6 +11,18 @@ from recon.rolling_shutter import GLOBAL_SHUTTER, FrameRows
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.matching import Pyramid
 from recon.types import F64, U8, PosePrior
+
+NO_IMAGE: U8 = np.zeros((0, 0), np.uint8)
+UNKNOWN = PosePrior()
+
+
+class Tracking(str, Enum):
+    STARTED = "started"  # first of a segment
+    WAITING = "waiting"  # the camera has not moved enough for a second view
+    TRACKED = "tracked"
+    KEYFRAME = "keyframe"
+    SKIPPED = "skipped"  # too close to the last one
+    LOST = "lost"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,22 +50,28 @@ class RelativePose:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UndistortedFrame:
-    """A frame without distortion but for its image in colour, which only views need.
+class Frame:
+    """One image of the camera, with what is known of it by now.
 
-    The odometry adds the motion of its rows. Once it has a pose it may take part in stereo, as a
-    view or as a view's partner, and its pose follows its odometry keyframe's.
+    The caller gives the image, its time and number, and telemetry; :class:`Undistort` the images
+    without distortion; the odometry the rest. A frame with a pose may take part in stereo, as a
+    view or as a view's partner, and its pose follows its odometry keyframe's. Images that are no
+    longer needed are :data:`NO_IMAGE`.
     """
 
+    image: U8  # (H, W, 3) BGR with distortion
+    time_ns: int  # mid-exposure; companion monotonic live, unix nanoseconds in a replay
     seq: int
-    time_ns: int
-    prior: PosePrior
-    image: U8 | None  # (H, W, 3) with distortion; None for one that is only a partner
-    gray: U8  # (H, W)
-    pyramid: Pyramid  # of (h, w) gray, as the odometry takes it; empty once it is tracked
-    mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
-    is_blurred: bool  # takes no part in stereo, only in the track
+    prior: PosePrior = UNKNOWN
+    gray: U8 = field(default_factory=lambda: NO_IMAGE)  # (H, W) without distortion
+    pyramid: Pyramid = ()  # of (h, w) gray, as the odometry takes it
+    mask: U8 | None = None  # (h, w) non-zero where the image is valid; None: everywhere
+    is_blurred: bool = False  # takes no part in stereo, only in the track
+    state: Tracking = Tracking.SKIPPED
+    segment: int = -1
     relative: RelativePose | None = None  # to the last keyframe when it was tracked
+    tracks: int = 0  # corners found
+    reason: str = ""  # why it has no pose
     row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known
 
     @property
@@ -61,20 +80,13 @@ class UndistortedFrame:
         return self.pyramid[0]
 
     @property
-    def segment(self) -> int:
-        return self._relative.segment
-
-    @property
     def keyframe(self) -> OdometryKeyframe:
-        assert self._relative.keyframe is not None, "a frame of stereo is not settled"
-        return self._relative.keyframe
+        assert self.relative is not None, "the frame is not tracked"
+        assert self.relative.keyframe is not None, "a frame of stereo is not settled"
+        return self.relative.keyframe
 
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
-        return self._relative.T_odom_camera
-
-    @property
-    def _relative(self) -> RelativePose:
         assert self.relative is not None, "the frame is not tracked"
-        return self.relative
+        return self.relative.T_odom_camera

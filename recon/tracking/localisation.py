@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
-from recon.tracking.frame import UndistortedFrame
+from recon.tracking.frame import Frame
 from recon.tracking.keyframe_window import OdometryKeyframe, median_depth
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.sift_features import FEATURE_SHARES, FeatureCache, FeatureMatches
@@ -93,7 +93,7 @@ class Localiser:
 
     def locate(
         self,
-        new: UndistortedFrame,
+        new: Frame,
         keyframes: Sequence[OdometryKeyframe],
         motion: ConstantVelocity,
         low_frame_rate: bool,
@@ -125,7 +125,7 @@ class Localiser:
         return reason if best is None else best
 
     def others(
-        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], found: Located
+        self, new: Frame, keyframes: Sequence[OdometryKeyframe], found: Located
     ) -> list[Located]:
         """The frame against the other recent keyframes that see the same ground."""
         share, least = 0.5 * SEARCH_SHARE, MIN_TRACKS // 3
@@ -134,9 +134,7 @@ class Localiser:
         located = [self.pose_from(key, new, T, share, least) for key in rest]
         return [other for other in located if not isinstance(other, str)]
 
-    def by_two_views(
-        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe]
-    ) -> TwoViewPose | None:
+    def by_two_views(self, new: Frame, keyframes: Sequence[OdometryKeyframe]) -> TwoViewPose | None:
         """The frame by two views alone: little of what it shares with a keyframe has landmarks.
 
         The scale is that of the keyframe's landmarks, or where none is shared of the ground
@@ -158,7 +156,7 @@ class Localiser:
         return None
 
     def with_features(
-        self, new: UndistortedFrame, key: OdometryKeyframe, uv: F64, ok: Bool
+        self, new: Frame, key: OdometryKeyframe, uv: F64, ok: Bool
     ) -> tuple[F64, Bool] | None:
         """Where (N, 2) a keyframe's corners are found, and which (N,), once the features that both
         images share are among them; None where they share none.
@@ -179,7 +177,7 @@ class Localiser:
         return np.vstack([uv, shared.uv_b[fresh]]), np.concatenate([ok, np.ones(count, np.bool_)])
 
     def _two_views(
-        self, new: UndistortedFrame, key: OdometryKeyframe, uv: F64, ok: Bool
+        self, new: Frame, key: OdometryKeyframe, uv: F64, ok: Bool
     ) -> TwoViewPose | None:
         """The pose by the keyframe's corners found at ``uv`` (N, 2) where ``ok`` (N,)."""
         if ok.sum() < 2 * MIN_TRACKS:
@@ -209,7 +207,7 @@ class Localiser:
 
     def _starts(
         self,
-        new: UndistortedFrame,
+        new: Frame,
         keyframes: Sequence[OdometryKeyframe],
         motion: ConstantVelocity,
         lost: bool,
@@ -230,7 +228,7 @@ class Localiser:
             yield from self._by_features(new, keyframes, low_frame_rate)
 
     def _by_features(
-        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
+        self, new: Frame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
     ) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
         for key, shared in self._shared(new, keyframes, low_frame_rate):
@@ -240,7 +238,7 @@ class Localiser:
                     yield key, T_camera_odom, share, True
 
     def _shared(
-        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
+        self, new: Frame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
     ) -> list[tuple[OdometryKeyframe, FeatureMatches]]:
         """Recent keyframes that share features with the frame, the most first."""
         here, found = (new.seq, new.small), []
@@ -266,7 +264,7 @@ class Localiser:
     def pose_from(
         self,
         key: OdometryKeyframe,
-        new: UndistortedFrame,
+        new: Frame,
         T_camera_odom: F64,
         share: float,
         least: int,
@@ -307,7 +305,7 @@ class Localiser:
     def _search(
         self,
         key: OdometryKeyframe,
-        new: UndistortedFrame,
+        new: Frame,
         T_camera_odom: F64,
         radius_px: float,
         most: int | None,
@@ -392,7 +390,7 @@ class Localiser:
         self._drift = np.eye(3)
 
     def match_first(
-        self, new: UndistortedFrame, first: OdometryKeyframe, R_b_a: F64 | None,
+        self, new: Frame, first: OdometryKeyframe, R_b_a: F64 | None,
         low_frame_rate: bool,
     ) -> tuple[F64, Bool]:  # fmt: skip
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame, by what is
@@ -411,7 +409,7 @@ class Localiser:
         return uv, ok
 
     def _guesses(
-        self, new: UndistortedFrame, first: OdometryKeyframe, R_b_a: F64 | None,
+        self, new: Frame, first: OdometryKeyframe, R_b_a: F64 | None,
         low_frame_rate: bool,
     ) -> Iterator[tuple[F64, F64, float]]:  # fmt: skip
         """Where the corners went, with warps and radius in px, best first."""
@@ -428,7 +426,7 @@ class Localiser:
             for radius_px in self._near_px:
                 yield *guess, radius_px
 
-    def _by_telemetry(self, new: UndistortedFrame, first: OdometryKeyframe, R_b_a: F64) -> F64:
+    def _by_telemetry(self, new: Frame, first: OdometryKeyframe, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""
         a, b = first.prior, new.prior
         height, t = b.agl_m or 0.0, np.zeros(3)
@@ -439,7 +437,7 @@ class Localiser:
         return np.asarray(K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(K))
 
     def _find(
-        self, key: OdometryKeyframe, new: UndistortedFrame, uv: F64, warp: F64, radius_px: float
+        self, key: OdometryKeyframe, new: Frame, uv: F64, warp: F64, radius_px: float
     ) -> tuple[F64, Bool]:
         """Where (N, 2) a keyframe's corners are in a frame, about ``uv``, and which are found."""
         found = matching.match(

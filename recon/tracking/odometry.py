@@ -11,16 +11,15 @@ heading and position are corrected afterwards by :mod:`recon.posegraph.alignment
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 
 import numpy as np
 
 from recon import se3
-from recon.rolling_shutter import GLOBAL_SHUTTER, NEAR_S, FrameRows, RowTrack
+from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.focal_watch import FocalWatch
-from recon.tracking.frame import UndistortedFrame
+from recon.tracking.frame import Frame, RelativePose, Tracking
 from recon.tracking.keyframe_window import (
     Landmarks,
     OdometryKeyframe,
@@ -66,26 +65,6 @@ EARLY = 4
 """Frames after a segment's first that show how its rows moved."""
 
 
-class Tracking(str, Enum):
-    STARTED = "started"  # first of a segment
-    WAITING = "waiting"  # the camera has not moved enough for a second view
-    TRACKED = "tracked"
-    KEYFRAME = "keyframe"
-    SKIPPED = "skipped"  # too close to the last one
-    LOST = "lost"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
-    state: Tracking
-    segment: int
-    T_odom_camera: F64 | None = None  # (4, 4)
-    tracks: int = 0
-    reason: str = ""
-    row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known
-    before: Tracked | None = None  # the still before, now a segment's first, and why it was lost
-
-
 class Odometry:
     """Follows one camera without distortion; feed it every frame in order."""
 
@@ -111,7 +90,8 @@ class Odometry:
         self.keyframes: list[OdometryKeyframe] = []  # of the current segment
         self.segment = -1
         self._lost = 0
-        self._missed_frame: tuple[UndistortedFrame, str] | None = None  # the last frame, and why
+        self._missed_frame: Frame | None = None  # the last still, where it is lost
+        self._late: Frame | None = None  # it, once the next still has placed it
         self._model: ConstantVelocity | None = None
         features = FeatureCache()
         self.exposure = ExposureWatch()
@@ -144,9 +124,15 @@ class Odometry:
         """True where the prior of a frame should hold the camera's angular velocity."""
         return self._row_track.needs_telemetry(time_ns)
 
-    def track(self, frame: UndistortedFrame) -> Tracked:
-        """Pose of a new frame, or why there is none. Of a blurred one a later frame makes a better
-        keyframe, if it comes soon."""
+    def track(self, frame: Frame) -> list[Frame]:
+        """The new frame with its pose, or why there is none; before it the last still, lost until
+        now, where both together start a segment."""
+        found, late, self._late = self._track(frame), self._late, None
+        return [found] if late is None else [late, found]
+
+    def _track(self, frame: Frame) -> Frame:
+        """The new frame. Of a blurred one a later frame makes a better keyframe, if it comes
+        soon."""
         time_ns, prior = frame.time_ns, frame.prior
         expected = self._expected(time_ns, prior)
         new = replace(frame, row_motion=self._row_track.expect(time_ns, prior, expected))
@@ -186,27 +172,38 @@ class Odometry:
         assert self._model is not None
         return self._model
 
-    def _missed(self, new: UndistortedFrame, reason: str) -> Tracked:
+    def _found(self, new: Frame, state: Tracking, T_odom_camera: F64, tracks: int = 0) -> Frame:
+        """The frame with its pose (4, 4), from now on relative to the newest keyframe."""
+        key = self.keyframes[-1]
+        T_keyframe_camera = se3.inverse(key.T_odom_camera) @ T_odom_camera
+        relative = RelativePose(new.seq, key.segment, T_keyframe_camera, key)
+        return replace(new, state=state, segment=self.segment, relative=relative, tracks=tracks)
+
+    def _unplaced(self, new: Frame, state: Tracking, reason: str, tracks: int = 0) -> Frame:
+        """The frame without a pose."""
+        return replace(new, state=state, segment=self.segment, tracks=tracks, reason=reason)
+
+    def _missed(self, new: Frame, reason: str) -> Frame:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
         if self._low_frame_rate and self._missed_frame is not None and self._lost >= 2:
-            (first, why), self._missed_frame = self._missed_frame, None
+            first, self._missed_frame = self._missed_frame, None
             started = self._start(first)
             if started.state is Tracking.STARTED:
                 second = self._second_view(new)
                 if second.state is Tracking.KEYFRAME:
-                    before = replace(started, state=Tracking.KEYFRAME, reason=why)
-                    return replace(second, before=before)
+                    self._late = replace(started, state=Tracking.KEYFRAME, reason=first.reason)
                 return second
         elif not self._low_frame_rate and self._lost >= LOST_AFTER:
             self._start(new)
-        self._missed_frame = (new, reason) if self._low_frame_rate else None
-        return Tracked(Tracking.LOST, self.segment, reason=reason)
+        lost = self._unplaced(new, Tracking.LOST, reason)
+        self._missed_frame = lost if self._low_frame_rate else None
+        return lost
 
-    def _start(self, new: UndistortedFrame) -> Tracked:
+    def _start(self, new: Frame) -> Frame:
         uv = self._corners(new)
         if len(uv) < 2 * MIN_TRACKS:
-            return Tracked(Tracking.LOST, self.segment, reason="too little texture")
+            return self._unplaced(new, Tracking.LOST, "too little texture")
         self.segment += 1
         self._lost = 0
         self._localiser.begin()
@@ -221,10 +218,10 @@ class Odometry:
         self.keyframes = [self._keyframe(new, T_camera_odom, uv, unknown, Landmarks())]
         self._row_track.add(new.row_motion, T_camera_odom)
         self._model = ConstantVelocity(new.time_ns, T_odom_camera, new.prior)
-        return Tracked(Tracking.STARTED, self.segment, T_odom_camera, row_motion=new.row_motion)
+        return self._found(new, Tracking.STARTED, T_odom_camera)
 
     def _keyframe(
-        self, new: UndistortedFrame, T_camera_odom: F64, uv: F64, landmark: I64, table: Landmarks
+        self, new: Frame, T_camera_odom: F64, uv: F64, landmark: I64, table: Landmarks
     ) -> OdometryKeyframe:
         """The frame as a keyframe with corners ``uv`` (N, 2)."""
         return OdometryKeyframe(
@@ -232,14 +229,14 @@ class Odometry:
             landmark, table, new.row_motion,
         )  # fmt: skip
 
-    def _corners(self, new: UndistortedFrame) -> F64:
+    def _corners(self, new: Frame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
         found = matching.harris_grid(new.small, MATCHING, new.mask)
         return found[:, :2].astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------
 
-    def _second_view(self, new: UndistortedFrame) -> Tracked:
+    def _second_view(self, new: Frame) -> Frame:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
@@ -257,9 +254,7 @@ class Odometry:
         if moved < least and (view is None or view.parallax_rad < least):
             if self._row_track.is_known and len(self._early) < EARLY:
                 self._early.append((new.row_motion, uv, ok))
-            return Tracked(
-                Tracking.WAITING, self.segment, tracks=int(ok.sum()), reason="too little motion"
-            )
+            return self._unplaced(new, Tracking.WAITING, "too little motion", int(ok.sum()))
         if view is None or view.parallax_rad < MIN_BASE_TO_HEIGHT:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
@@ -278,7 +273,7 @@ class Odometry:
         return off_px > 2.0 * two_view.MAX_ERROR_PX
 
     def _motion_of_two(
-        self, new: UndistortedFrame, uv: F64, ok: Bool, R_b_a: F64 | None
+        self, new: Frame, uv: F64, ok: Bool, R_b_a: F64 | None
     ) -> two_view.TwoView | None:
         """The motion since the first frame, whose corners are at ``uv`` (N, 2) where ``ok``."""
         first = self.keyframes[0]
@@ -315,7 +310,7 @@ class Odometry:
 
     # ---- keyframes ---------------------------------------------------------------------
 
-    def _accept(self, new: UndistortedFrame, found: Located) -> Tracked:
+    def _accept(self, new: Frame, found: Located) -> Frame:
         """Keep the pose; make the frame a keyframe when it has moved enough."""
         key = found.key
         T_camera_odom = found.pose.T_camera_points
@@ -332,9 +327,7 @@ class Odometry:
         if base < due and found.share > 0.45 and turned < MAX_TURN_RAD:
             self._row_track.add(new.row_motion, T_camera_odom)
             self._settle()
-            return Tracked(
-                Tracking.TRACKED, self.segment, T_odom_camera, tracks, row_motion=new.row_motion
-            )
+            return self._found(new, Tracking.TRACKED, T_odom_camera, tracks)
         self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns)
         share = 0.5 * SEARCH_SHARE
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, MIN_TRACKS)
@@ -346,7 +339,8 @@ class Odometry:
             new, found.pose.T_camera_points, [(other.key, other.uv, other.ok) for other in seen]
         )
         self._motion_model.correct(self.keyframes[-1].T_odom_camera)
-        return self._as_keyframe(new, found.ok)
+        newest = self.keyframes[-1].T_odom_camera
+        return self._found(new, Tracking.KEYFRAME, newest, int(found.ok.sum()))
 
     def _px_s(self, T_odom_camera: F64, depth: float) -> F64:
         """(2,) motion of the image since the frame before; zero for stills, which are far apart."""
@@ -355,22 +349,18 @@ class Odometry:
             return np.zeros(2)
         return np.asarray(self.K[0, 0] / gap_s * self._motion_model.across(T_odom_camera, depth))
 
-    def _accept_two_views(self, new: UndistortedFrame, found: TwoViewPose) -> Tracked:
+    def _accept_two_views(self, new: Frame, found: TwoViewPose) -> Frame:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
         key, T_camera_odom, uv, ok = found
         self._add_keyframe(new, T_camera_odom, [(key, uv, ok)])
         self._motion_model.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
-        return self._as_keyframe(new, ok)
-
-    def _as_keyframe(self, new: UndistortedFrame, ok: Bool) -> Tracked:
-        """The newest keyframe's outcome, by the corners that are ``ok``."""
-        T, tracks = self.keyframes[-1].T_odom_camera, int(ok.sum())
-        return Tracked(Tracking.KEYFRAME, self.segment, T, tracks, row_motion=new.row_motion)
+        newest = self.keyframes[-1].T_odom_camera
+        return self._found(new, Tracking.KEYFRAME, newest, int(ok.sum()))
 
     def _add_keyframe(
         self,
-        new: UndistortedFrame,
+        new: Frame,
         T_camera_odom: F64,
         seen: list[tuple[OdometryKeyframe, F64, Bool]],
     ) -> None:

@@ -23,7 +23,8 @@ from recon.camera_model import scaled
 from recon.parallel import limit_threads
 from recon.pipeline.mapper import Mapper
 from recon.tracking.adjusted_track import AdjustedStill, AdjustedTrack
-from recon.types import F64, U8, Camera, Frame, PosePrior
+from recon.tracking.frame import Frame
+from recon.types import F64, U8, Camera, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter
 from service.cameras.images import ImagesSource
 from service.cameras.rig import Rig, turn_sigma_rad_s
@@ -106,11 +107,11 @@ def _tracked(
         state = history.state_at(check.exposed_ns(time_ns))
         prior = rig.prior(state, frame.geotag)
         undistorted = mapper.undistort(Frame(frame.image, time_ns, frame.seq, prior))
-        tracked = mapper.locate(undistorted)
+        *late, tracked = mapper.locate(undistorted)
         check.add(time_ns, tracked)
-        is_tracked = tracked.T_odom_camera is not None
-        if tracked.before is not None:
+        if late:
             out[-1] = replace(out[-1], is_tracked=True)
+        is_tracked = tracked.relative is not None
         out.append(Still(frame.seq, _small(frame), frame.time_ns, is_tracked))
     check.finish()
     return out, check.latency

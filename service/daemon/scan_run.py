@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mavlink.component.vehicle import VehicleLink
-    from recon.types import F64, Frame, Keyframe
+    from recon.tracking.frame import Frame
+    from recon.types import F64, Keyframe
     from service.daemon.frame_gate import FrameGate
     from service.flight.scan import Scan
     from service.stream.store import ScanStore

@@ -18,8 +18,7 @@ from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import pose_at
 from recon.posegraph.ground_heights import GUESSED_SHARE
 from recon.poses import sigma_m
-from recon.tracking.frame import RelativePose
-from recon.tracking.odometry import Tracking
+from recon.tracking.frame import RelativePose, Tracking
 from recon.types import F64, Keyframe, Pose
 from service.cameras.rig import Rig, attitude_of
 from service.flight.pipeline import Pipeline
@@ -88,11 +87,11 @@ class Recorder:
         self._agl_before_m = agl_m
 
     def _write_pose(self, posed: FramePosed, agl_m: float | None) -> None:
-        self.states[posed.tracked.state] += 1
+        self.states[posed.frame.state] += 1
         pose = posed.pose
         if pose is None:
             return
-        time_ns, relative = posed.time_ns + self._offset_ns, posed.relative
+        time_ns, relative = posed.frame.time_ns + self._offset_ns, posed.frame.relative
         if relative is not None:
             row = np.zeros((), FRAME)
             row["time_ns"], row["is_view"], row["sigma_m"] = time_ns, posed.is_view, sigma_m(pose)

@@ -11,8 +11,8 @@ import numpy as np
 
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.sensor_offsets import Constants
+from recon.tracking.frame import Frame, Tracking
 from recon.tracking.motion_blur import ExposureWatch
-from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64
 from service.scans.trust import scales_differ
 from service.stream.records import pack_covariance, pack_motion
@@ -191,10 +191,10 @@ class TrackingWatch:
         self._frames, self._is_reported = 0, False
         self._reasons: Counter[str] = Counter()
 
-    def look(self, tracked: Tracked, time_ns: int) -> None:
+    def look(self, frame: Frame, time_ns: int) -> None:
         """Take the result of a frame; times never decrease. A camera that stands still is not
         lost."""
-        if tracked.state in FOUND:
+        if frame.state in FOUND:
             if self._is_reported:
                 self._warn("Tracking recovered")
             self._since_ns, self._frames, self._is_reported = None, 0, False
@@ -202,7 +202,7 @@ class TrackingWatch:
             return
         self._since_ns = time_ns if self._since_ns is None else self._since_ns
         self._frames += 1
-        self._reasons[tracked.reason] += tracked.state is Tracking.LOST
+        self._reasons[frame.reason] += frame.state is Tracking.LOST
         for_s = 1e-9 * (time_ns - self._since_ns)
         is_lost = 2 * self._reasons.total() > self._frames
         if for_s >= LOST_S and is_lost and not self._is_reported:

@@ -23,7 +23,8 @@ from recon.pipeline.events import Event as MapperEvent
 from recon.pipeline.events import FramePosed
 from recon.posegraph.pose_priors import VelocityIntegrator
 from recon.tracking.adjusted_track import AdjustedTrack
-from recon.types import Camera, Frame, Keyframe, Pose, PosePrior, Shutter
+from recon.tracking.frame import Frame
+from recon.types import Camera, Keyframe, Pose, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.lens import MAX_FOCAL
 from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
@@ -187,8 +188,8 @@ class Scan:
             events = self.mapper.track(Frame(frame.image, exposed_ns, frame.seq, prior))
         posed = events[-1]
         assert isinstance(posed, FramePosed)
-        self.check.add(time_ns, posed.tracked)
-        self.tracking.look(posed.tracked, time_ns)
+        self.check.add(time_ns, posed.frame)
+        self.tracking.look(posed.frame, time_ns)
         self.shutter.look()
         for doubt in self.pipeline.new_doubts():
             inputs.warn(doubt)

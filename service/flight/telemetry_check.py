@@ -18,7 +18,7 @@ from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import GimbalFrame
 from recon.frames import R_GIMBAL_CAMERA
 from recon.se3 import quaternion_from_rotation
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.frame import Frame, Tracking
 from recon.types import F64
 from service.config import CameraConfig
 
@@ -100,16 +100,16 @@ class TelemetryCheck:
 
     # ---- what the images say -------------------------------------------------------------
 
-    def add(self, stamp_ns: int, tracked: Tracked) -> None:
+    def add(self, stamp_ns: int, frame: Frame) -> None:
         """Add a frame's pose by vision, at its stamp; evaluate all of them now and then."""
-        if self._history is None or tracked.state is Tracking.SKIPPED:
+        if self._history is None or frame.state is Tracking.SKIPPED:
             return
-        T = tracked.T_odom_camera
         last, self._last = self._last, None
-        if T is not None:
-            self._last = (stamp_ns, tracked.segment, T[:3, :3].copy())
-            if last is not None and last[1] == tracked.segment:
-                self._turn(last[0], stamp_ns, last[2].T @ T[:3, :3])
+        if frame.relative is not None:
+            R_odom_camera = frame.T_odom_camera[:3, :3]
+            self._last = (stamp_ns, frame.segment, R_odom_camera)
+            if last is not None and last[1] == frame.segment:
+                self._turn(last[0], stamp_ns, last[2].T @ R_odom_camera)
         if self._next_ns is None:
             self._next_ns = stamp_ns + LOOK_NS
         elif stamp_ns >= self._next_ns:

@@ -46,17 +46,17 @@ class OdometryReport:
 
     def send(self, posed: FramePosed, state: VehicleState | None) -> None:
         """Hand on the pose of one frame; nothing for a frame without one by vision."""
-        pose, time_ns = posed.pose, posed.time_ns
-        if pose is None or posed.relative is None:
+        pose, frame = posed.pose, posed.frame
+        if pose is None or frame.relative is None:
             return
         position: F64 = np.asarray(R_ENU_NED.T @ pose.T_world_camera[:3, 3])
         R_ned_head = R_ENU_NED.T @ pose.T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
         R_ned_body: F64 = np.asarray(R_ned_head @ self._body_of_head(state))
-        velocity = self._move(time_ns, posed.tracked.segment, position)
+        velocity = self._move(frame.time_ns, frame.segment, position)
         w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_body))
         a, b, c = (float(v) for v in R_ned_body.T @ velocity)
         north, east, down = (float(v) for v in position)
-        quality = round(100.0 * min(1.0, posed.tracked.tracks / BEST_TRACKS))
+        quality = round(100.0 * min(1.0, frame.tracks / BEST_TRACKS))
         odometry = BodyOdometry(
             (north, east, down),
             (w, x, y, z),
@@ -65,7 +65,7 @@ class OdometryReport:
             self.resets,
             max(1, quality),
         )
-        self._send(odometry, time_ns)
+        self._send(odometry, frame.time_ns)
 
     def _body_of_head(self, state: VehicleState | None) -> F64:
         """(3, 3) body's attitude in the head's axes, by telemetry or by the fixed mount."""

@@ -212,7 +212,7 @@ def height_errors(flown: list[U8], shutter: Shutter) -> F64:
             T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0,
             velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn,
         )  # fmt: skip
-        assert odometry.track(undistorted(image, i, int(i * 1e9 / 15), prior)).state != "lost"
+        assert odometry.track(undistorted(image, i, int(i * 1e9 / 15), prior))[-1].state != "lost"
     off = []
     for key in odometry.keyframes:
         points = key.landmarks[key.landmark[key.landmarks.known(key.landmark)]]

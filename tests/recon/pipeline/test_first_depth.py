@@ -9,7 +9,8 @@ from painted_ground import CAMERA, HEIGHT_M, pose, still
 
 from recon.pipeline.events import Event, KeyframeReady, PosesChanged
 from recon.pipeline.mapper import Mapper, MapperConfig
-from recon.types import F64, Frame, PosePrior
+from recon.tracking.frame import Frame
+from recon.types import F64, PosePrior
 from service.config import load_config
 from service.flight.pipeline import mapper_config
 

@@ -17,7 +17,7 @@ from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import sigma_m
-from recon.tracking.frame import RelativePose
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose
 from recon.types import F64, Pose, PosePrior
 
 RNG = np.random.default_rng(4)
@@ -25,6 +25,13 @@ RNG = np.random.default_rng(4)
 
 def frame_at(seq: int, north_m: float) -> RelativePose:
     return RelativePose(seq, 3, se3.compose(np.eye(3), np.array([0.0, north_m, 50.0])))
+
+
+def placed(frames: FramePoses, prior: PosePrior, relative: RelativePose) -> Pose:
+    segment = relative.segment
+    pose = frames.place(Frame(NO_IMAGE, 0, relative.seq, prior, segment=segment, relative=relative))
+    assert pose is not None
+    return pose
 
 
 def empty() -> KeyframeMap:
@@ -37,7 +44,7 @@ def following() -> Any:
     def follow(seq: int, north_m: float, fix: F64 | None = None) -> Pose:
         sigma = None if fix is None else np.full(3, 5.0)
         prior = PosePrior(position_m=fix, sigma_position_m=sigma)
-        pose = frames.place(prior, frame_at(seq, north_m))
+        pose = placed(frames, prior, frame_at(seq, north_m))
         place_m = pose.T_world_camera[:3, 3]
         frame = frame_at(seq, north_m)
         published = pose_at(frame.T_odom_camera, place_m, np.full(3, sigma_m(pose) / 3**0.5))
@@ -113,7 +120,7 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     frames = FramePoses(keyframes, lambda frame: False)
     key = keyframe_at(3, some_pose())
     frame, view = (RelativePose(seq, 0, some_pose(), key) for seq in (7, 5))
-    assert frames.place(PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
+    assert placed(frames, PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
     update = keyframes.add(view_at(5, view.T_odom_camera), None)
     trajectory, known = keyframes.trajectory, keyframes.trajectory.pose(5)
     keyframes.trajectory = None
@@ -139,7 +146,7 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
     view, frame = (RelativePose(seq, 0, some_pose(), key) for seq in (5, 7))
     frames.add_view(view, keyframes.add(view_at(5, view.T_odom_camera, prior=prior), None))
-    in_flight = frames.place(prior, frame)
+    in_flight = placed(frames, prior, frame)
     keyframes.trajectory.moved(final=True)
     frames.finish()
     again = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, Reconstructed, moved
 from recon.pipeline.views import StereoView
-from recon.tracking.odometry import Tracked, Tracking
-from recon.types import Camera, DepthMap, Frame, Keyframe, Pose, PosePrior
+from recon.tracking.frame import Frame, Tracking
+from recon.types import Camera, DepthMap, Keyframe, Pose, PosePrior
 
 CAMERA = Camera(np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.zeros(5), (80, 60))
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -105,17 +106,18 @@ def test_a_keyframe_does_not_wait_for_the_next_frame_that_is_looked_at(
     monkeypatch.setattr(mapper.odometry, "can_skip", lambda *_: True)
     ready, changed, skipped = mapper.skip(5, 0, PosePrior())
     assert isinstance(ready, KeyframeReady) and isinstance(changed, PosesChanged)
-    assert isinstance(skipped, FramePosed) and skipped.seq == 5
+    assert isinstance(skipped, FramePosed) and skipped.frame.seq == 5
 
 
 def test_a_keyframe_does_not_wait_until_the_track_is_found_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     mapper = Mapper(CAMERA, worker=BrokenOff)
-    monkeypatch.setattr(mapper.odometry, "track", lambda _: Tracked(Tracking.LOST, 0))
+    lose = partial(replace, state=Tracking.LOST)
+    monkeypatch.setattr(mapper.odometry, "track", lambda frame: [lose(frame)])
     ready, changed, lost = mapper.track(Frame(np.zeros((60, 80, 3), np.uint8), 0, 5, PosePrior()))
     assert isinstance(ready, KeyframeReady) and isinstance(changed, PosesChanged)
-    assert isinstance(lost, FramePosed) and lost.seq == 5
+    assert isinstance(lost, FramePosed) and lost.frame.seq == 5
 
 
 def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:

@@ -21,22 +21,22 @@ from recon.pipeline.views import (
     frames_apart,
 )
 from recon.rolling_shutter import FrameRows, RowClock, Rows
-from recon.tracking.frame import RelativePose, UndistortedFrame
+from recon.tracking.frame import Frame, RelativePose, Tracking
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.motion_blur import ExposureWatch
-from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import Camera, PosePrior
 
 
-def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> UndistortedFrame:
+def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Frame:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = keyframe_at(seq, T, segment)
     image = np.zeros((32, 32, 3), np.uint8)
     relative = RelativePose(seq, segment, np.eye(4), key)
-    return UndistortedFrame(
-        seq, seq, PosePrior(), image, image[..., 0], (), None, blurred, relative
-    )  # fmt: skip
+    return Frame(
+        image, seq, seq, gray=image[..., 0], is_blurred=blurred, segment=segment, relative=relative
+    )
 
 
 @dataclass
@@ -65,10 +65,9 @@ def stereo_camera(
 
 def offer(
     views: ViewSelection, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
-) -> UndistortedFrame | None:
-    taken = frame(seq, x_m, segment, blurred)
-    tracked = Tracked(Tracking(state), segment, taken.T_odom_camera)
-    return taken if views.offer(taken, tracked) else None
+) -> Frame | None:
+    taken = replace(frame(seq, x_m, segment, blurred), state=Tracking(state))
+    return taken if views.offer(taken) else None
 
 
 def test_colour_is_undistorted_when_its_view_is_given_and_not_kept() -> None:
@@ -82,9 +81,9 @@ def test_colour_is_undistorted_when_its_view_is_given_and_not_kept() -> None:
         keys.append(plain.keyframe)
         image = np.random.default_rng(i).integers(0, 255, (32, 32, 3), np.uint8)
         held.append((weakref.ref(image), Undistorter(lens).image(image)))
-        taken = replace(plain, image=image, relative=None)
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        views.take(taken, Tracked(state, 0, plain.T_odom_camera))
+        taken = replace(plain, image=image, state=state)
+        views.take(taken)
         del image, taken
     assert not undistorter.image.called and all(there() is not None for there, _ in held)
     for view, (_, want) in zip(views.ready(everything=True), held, strict=True):
@@ -228,11 +227,9 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         row_motion = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
-        image = UndistortedFrame(
-            i, i, PosePrior(), plain.image, plain.gray, plain.pyramid, None, False
-        )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        views.take(image, Tracked(state, 0, plain.T_odom_camera, row_motion=row_motion))
+        relative = RelativePose(i, 0, np.eye(4), keys[-1])
+        views.take(replace(plain, state=state, relative=relative, row_motion=row_motion))
     shares = [view.rows_share for view in views.ready(everything=True)]
     assert len(shares) == 3 and all((share.min() > 0.005) == expected for share in shares)
 
@@ -256,11 +253,8 @@ def test_views_wait_for_the_first_word_on_their_readout(
         plain = frame(i, 5.0 * i)
         keys.append(plain.keyframe)
         row_motion = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
-        image = UndistortedFrame(
-            i, i, PosePrior(), plain.image, plain.gray, plain.pyramid, None, False
-        )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        views.take(image, Tracked(state, 0, plain.T_odom_camera, row_motion=row_motion))
+        views.take(replace(plain, state=state, row_motion=row_motion))
         search.is_open = is_open and i < 5
         given += list(views.ready())
         counts.append(len(given))
@@ -277,8 +271,7 @@ def test_a_view_that_waited_while_the_next_segment_grew_is_confirmed_by_its_own(
         keys.append(plain.keyframe)
         row_motion = FrameRows(i, PosePrior(), np.eye(4), is_measured=True)
         state = Tracking.KEYFRAME if i % 4 else Tracking.STARTED
-        tracked = Tracked(state, i // 4, plain.T_odom_camera, row_motion=row_motion)
-        views.take(replace(plain, relative=None), tracked)
+        views.take(replace(plain, state=state, row_motion=row_motion))
         given += [view.seq for view in views.ready()]
     assert given == [0, 1, 2, 3]
 
@@ -293,12 +286,9 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
     for i in range(4):
         plain = frame(i, float(i))
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
-        image = UndistortedFrame(
-            i, i * 10**8, PosePrior(), plain.image, plain.gray, plain.pyramid, None,
-            False,
-        )  # fmt: skip
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        views.take(image, Tracked(state, 0, plain.T_odom_camera))
+        relative = RelativePose(i, 0, np.eye(4), keys[-1])
+        views.take(replace(plain, time_ns=i * 10**8, state=state, relative=relative))
     blurs = [view.image.blur_px for view in views.ready(everything=True)]
     if not exposure_s:
         assert blurs == [None] * 4
@@ -315,15 +305,12 @@ def test_a_view_is_given_once_with_the_first_frame_that_shows_its_depth() -> Non
     views = stereo_camera(keys)
 
     def take(seq: int, x_m: float, blurred: bool = False) -> None:
-        plain = frame(seq, x_m)
+        plain = frame(seq, x_m, blurred=blurred)
         is_key = seq % 10 == 0
         if is_key:
             keys.append(plain.keyframe)
-        image = UndistortedFrame(
-            seq, seq, PosePrior(), plain.image, plain.gray, plain.pyramid, None, blurred
-        )
         state = Tracking.TRACKED if not is_key else Tracking.KEYFRAME if seq else Tracking.STARTED
-        views.take(image, Tracked(state, 0, plain.T_odom_camera))
+        views.take(replace(plain, state=state))
 
     take(0, 0.0)
     take(10, 6.0)

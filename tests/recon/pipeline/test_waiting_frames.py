@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 from unittest.mock import Mock
 
@@ -9,11 +10,11 @@ import numpy as np
 import pytest
 
 from recon.pipeline.mapper import Mapper
-from recon.tracking.frame import UndistortedFrame
-from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.types import F64, Camera
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.odometry import Odometry
+from recon.types import Camera
 
-POSE = cast(F64, object())
+POSE = cast(RelativePose, object())
 STARTED, WAITING = (Tracking.STARTED, POSE, ""), (Tracking.WAITING, None, "too little motion")
 KEYFRAME, LOST = (Tracking.KEYFRAME, POSE, ""), (Tracking.LOST, None, "too few matches")
 
@@ -28,8 +29,11 @@ KEYFRAME, LOST = (Tracking.KEYFRAME, POSE, ""), (Tracking.LOST, None, "too few m
     ],
 )  # fmt: skip
 def test_waiting_counts_where_it_is_in_vain(states: list[Any], unused: dict[str, int]) -> None:
-    results = iter([Tracked(state, 0, T, reason=why) for state, T, why in states])
-    odometry, image = Mock(Odometry), Mock(UndistortedFrame)
+    image = Frame(NO_IMAGE, 0, 0, segment=0)
+    results = iter(
+        [[replace(image, state=state, relative=at, reason=why)] for state, at, why in states]
+    )
+    odometry = Mock(Odometry)
     odometry.track.side_effect = results
     mapper = Mapper(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32)))
     mapper.odometry = odometry

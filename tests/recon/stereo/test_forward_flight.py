@@ -24,7 +24,8 @@ from recon.stereo.virtual_stereo import (
     drop_unseen,
     rectify,
 )
-from recon.types import F64, U8, Camera, Frame, Keyframe, PolarPair, PosePrior, RectifiedPair
+from recon.tracking.frame import Frame
+from recon.types import F64, U8, Camera, Keyframe, PolarPair, PosePrior, RectifiedPair
 from service.config import load_config
 from service.flight.pipeline import Pipeline
 

@@ -14,9 +14,10 @@ from tracked_frame import undistorted
 
 from recon import se3
 from recon.tracking import matching
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import TRACKED_LANDMARKS, Localiser
-from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Bool, Camera, PosePrior, Shutter
 from service.config import ScanConfig
 
@@ -64,7 +65,7 @@ def prior_of(T: F64, rng: np.random.Generator) -> PosePrior:
 
 def fly(
     ground: U8, track: list[F64], telemetry: bool, images: dict[int, U8] | None = None
-) -> tuple[Odometry, list[Tracked]]:
+) -> tuple[Odometry, list[Frame]]:
     """Run the odometry at 5 Hz; ``images`` replaces some of the frames."""
     rng = np.random.default_rng(2)
     odometry, out = Odometry(CAMERA), []
@@ -72,16 +73,16 @@ def fly(
         image = photograph(ground, T)
         image = (images or {}).get(i, image)
         prior = prior_of(T, rng) if telemetry else PosePrior(DOWN, 0.1, 3.0, agl_m=60.0)
-        out.append(odometry.track(undistorted(image, i, i * 200_000_000, prior)))
+        out += odometry.track(undistorted(image, i, i * 200_000_000, prior))
     return odometry, out
 
 
-def drift(track: list[F64], found: list[Tracked]) -> float:
+def drift(track: list[F64], found: list[Frame]) -> float:
     """RMS distance after the best similarity, in metres."""
     pairs = [
         (f.T_odom_camera[:3, 3], T[:3, 3])
         for f, T in zip(found, track, strict=True)
-        if f.T_odom_camera is not None
+        if f.relative is not None
     ]
     a, b = (np.array(x) for x in zip(*pairs, strict=True))
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
@@ -154,7 +155,7 @@ def test_a_camera_that_circles_a_place_moves(ground: U8, step_rad: float) -> Non
     for i, T in enumerate(track):
         prior = PosePrior(DOWN, 0.4, 3.0, agl_m=60.0)
         time_ns = round(i * step_rad * 1e10)
-        found.append(odometry.track(undistorted(photograph(ground, T), i, time_ns, prior)))
+        found += odometry.track(undistorted(photograph(ground, T), i, time_ns, prior))
     placed = [f.state in ("tracked", "keyframe") for f in found]
     assert odometry.segment == 0 and sum(placed) > 0.6 * len(placed)
     assert drift(track, found) < 0.02 * 60.0
@@ -168,7 +169,7 @@ def test_a_turn_on_the_spot_without_attitude_makes_no_surface(ground: U8, focal_
     for i in range(15):
         R = se3.so3_exp(np.array([0.004 * i, 0.0, 0.1 * i])) @ DOWN
         image = photograph(ground, se3.compose(R, np.array([0.0, 0.0, 60.0])))
-        found = odometry.track(
+        (found,) = odometry.track(
             undistorted(image, i, 200_000_000 * i, PosePrior(DOWN, 0.4, 3.0, agl_m=60.0))
         )
         assert found.state in ("started", "waiting")
@@ -196,7 +197,7 @@ def test_noise_is_not_followed() -> None:
             undistorted(
                 rng.integers(0, 255, (360, 480), dtype=np.uint8), i, i * 200_000_000, PosePrior()
             )
-        ).state
+        )[0].state
         for i in range(12)
     ]
     assert "keyframe" not in states and "tracked" not in states
@@ -209,16 +210,16 @@ def skipping(
     lens: Camera | None = None,
     seeks: bool = False,
     attitude: bool = True,
-) -> list[Tracked]:
+) -> list[Frame]:
     """Run the odometry with telemetry of constant error, without the frames that it can skip."""
     odometry, out = Odometry(CAMERA, lens, seeks_readout=seeks), []
     for i, T in enumerate(track):
         time_ns, prior = round(i * 1e9 / fps), prior_of(T, np.random.default_rng(2))
         prior = prior if attitude else replace(prior, R_world_camera=None)
         if odometry.can_skip(time_ns, prior, frames_per_step=6.0):
-            out.append(Tracked(Tracking.SKIPPED, odometry.segment))
+            out.append(Frame(NO_IMAGE, time_ns, i, prior, segment=odometry.segment))
         else:
-            out.append(odometry.track(undistorted(photograph(ground, T), i, time_ns, prior)))
+            out += odometry.track(undistorted(photograph(ground, T), i, time_ns, prior))
     return out
 
 

@@ -17,9 +17,10 @@ from tracked_frame import undistorted
 from recon.backends import load_backend
 from recon.camera_model import scaled
 from recon.pipeline.events import Event, FramePosed
+from recon.tracking.frame import Frame, Tracking
 from recon.tracking.localisation import Localiser, Located, Start
-from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.types import F64, U8, Frame, PosePrior
+from recon.tracking.odometry import Odometry
+from recon.types import F64, U8, PosePrior
 from service.config import load_config
 from service.flight.pipeline import Pipeline
 
@@ -27,9 +28,9 @@ PLACED = ("started", "tracked", "keyframe")
 OFF = 0.1
 
 
-def flown(
+def followed(
     images: list[U8], sigma_yaw_rad: float = 3.0, step_ns: int = 2_000_000_000
-) -> list[Tracked]:
+) -> list[list[Frame]]:
     """The odometry over stills two seconds apart, each said to look down, its top to the north.
 
     By default only the nominal mount is known, and no heading.
@@ -41,12 +42,19 @@ def flown(
     ]
 
 
-def off_m(track: list[F64], found: list[Tracked]) -> float:
+def flown(
+    images: list[U8], sigma_yaw_rad: float = 3.0, step_ns: int = 2_000_000_000
+) -> list[Frame]:
+    """Each still as it was when it came."""
+    return [found[-1] for found in followed(images, sigma_yaw_rad, step_ns)]
+
+
+def off_m(track: list[F64], found: list[Frame]) -> float:
     """RMS distance of the places after the best similarity."""
     pairs = [
         (f.T_odom_camera[:3, 3], T[:3, 3])
         for f, T in zip(found, track, strict=True)
-        if f.T_odom_camera is not None
+        if f.relative is not None
     ]
     a, b = (np.array(x) for x in zip(*pairs, strict=True))
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
@@ -56,7 +64,7 @@ def off_m(track: list[F64], found: list[Tracked]) -> float:
     return float(np.sqrt(np.mean(np.sum((scale * a @ (U @ flip @ Vt).T - b) ** 2, axis=1))))
 
 
-def assert_one_piece(track: list[F64], found: list[Tracked], share_of_height: float) -> None:
+def assert_one_piece(track: list[F64], found: list[Frame], share_of_height: float) -> None:
     assert [f.state in PLACED for f in found] == [True] * len(found), [f.reason for f in found]
     assert {f.segment for f in found} == {0}
     assert off_m(track, found) < share_of_height * HEIGHT_M
@@ -141,7 +149,7 @@ def test_stills_whose_corners_differ_are_tied_by_their_features(
         noise = np.random.default_rng(i).normal(size=camera.size_px[::-1])
         leaves = np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.7))
         image = np.clip(still(T, camera) + 20.0 * leaves / leaves.std(), 0, 255).astype(np.uint8)
-        found.append(odometry.track(undistorted(image, i, i * 2_000_000_000, prior)))
+        found += odometry.track(undistorted(image, i, i * 2_000_000_000, prior))
     assert_one_piece(track, found, 0.005)
     assert min(counts) > 80
 
@@ -183,16 +191,16 @@ def test_rows_of_a_field_are_not_taken_for_one_another() -> None:
 def test_stills_of_other_places_are_not_joined() -> None:
     here = [pose(0.3 * FOOTPRINT_M * i - 90.0, seed=i) for i in range(3)]
     there = [pose(0.3 * FOOTPRINT_M * i + 30.0, seed=5 + i) for i in range(3)]
-    found = flown([still(T) for T in here + there])
+    each = followed([still(T) for T in here + there])
+    found = [one[-1] for one in each]
     assert found[3].state == "lost"
     assert [f.state for f in found[4:]] == ["keyframe"] * 2
     assert {f.segment for f in found[4:]} == {1}
-    first = found[4].before  # the segment begins with the still that was lost when it came
-    assert first is not None and first.state == "keyframe" and first.segment == 1
+    first = each[4][0]  # the segment begins with the still that was lost when it came
+    assert first.seq == 3 and first.state == "keyframe" and first.segment == 1
     assert first.reason == found[3].reason
-    assert first.T_odom_camera is not None and found[4].T_odom_camera is not None
     assert np.linalg.norm((first.T_odom_camera - found[4].T_odom_camera)[:3, 3]) > 1.0
-    assert [f.before for f in found if f is not found[4]] == [None] * 5
+    assert [len(one) for one in each] == [1, 1, 1, 1, 2, 1]
 
 
 @pytest.mark.slow
@@ -211,10 +219,12 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
         events += pipeline.mapper.track(Frame(image, i * 2_000_000_000, i, prior))
     events += pipeline.mapper.finish()
     posed = [event for event in events if isinstance(event, FramePosed)]
-    assert [event.seq for event in posed] == [0, 1, 2, 3, 3, 4, 5]
+    assert [event.frame.seq for event in posed] == [0, 1, 2, 3, 3, 4, 5]
     lost, late = posed[3:5]
-    assert lost.tracked.state is Tracking.LOST and late.is_view
-    assert late.relative is not None and late.relative.seq == 3 and late.pose is not None
+    assert lost.frame.state is Tracking.LOST and late.is_view
+    assert (
+        late.frame.relative is not None and late.frame.relative.seq == 3 and late.pose is not None
+    )
     np.testing.assert_allclose(late.pose.T_world_camera[:3, 3], track[3][:3, 3], atol=2.0)
     keyframes = [keyframe.seq for keyframe in keyframes_of(events)]
     assert keyframes == list(range(6))

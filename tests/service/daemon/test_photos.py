@@ -16,7 +16,8 @@ from mavlink.component.camera import KeyframeReport
 from mavlink.component.control import Result
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
-from recon.types import Frame, PosePrior
+from recon.tracking.frame import Frame
+from recon.types import PosePrior
 from service.cameras.exif import read_tags
 from service.cameras.source import CameraFrame
 from service.daemon.load_shedding import Level

@@ -19,7 +19,8 @@ from mavlink.telemetry.samples import VehicleState
 from recon import parallel, se3
 from recon.backends import load_backend
 from recon.pipeline.events import FramePosed
-from recon.types import F64, U8, Camera, Frame, Keyframe
+from recon.tracking.frame import Frame
+from recon.types import F64, U8, Camera, Keyframe
 from service.cameras.rig import Rig
 from service.config import load_config
 from service.flight.pipeline import Pipeline
@@ -177,7 +178,7 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
         )  # fmt: skip
         *_, posed = pipeline.mapper.track(Frame(image, i * 40_000_000, i, rig.prior(sensed, None)))
         if isinstance(posed, FramePosed) and posed.pose is not None:
-            kept = seen if posed.relative is not None else lost
+            kept = seen if posed.frame.relative is not None else lost
             kept.append((i, posed.pose.T_world_camera[:3, 3]))
     pipeline.mapper.finish()
     assert len(seen) > 30 and len(lost) > 8

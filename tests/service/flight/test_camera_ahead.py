@@ -13,7 +13,7 @@ import pytest
 
 from recon.backends.cpu import CpuBackend
 from recon.pipeline.events import FramePosed
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import U8, Camera
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import load_config
@@ -82,7 +82,7 @@ def test_a_frame_that_tracking_skips_is_not_looked_at(
         frame = CameraFrame(unseen, 0, 0, None, "frame 0")
         with pytest.raises(AssertionError, match="looked at"):
             scan.feed(frame)
-        skipped = FramePosed(0, 0, Tracked(Tracking.SKIPPED, 0))
+        skipped = FramePosed(Frame(NO_IMAGE, 0, 0))
         monkeypatch.setattr(scan.mapper, "skip", lambda seq, time_ns, prior: (skipped,))
         assert scan.feed(frame) is skipped
         assert scan.recorder.states[Tracking.SKIPPED] == 1

@@ -19,8 +19,7 @@ from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
 from recon.poses import sigma_m
-from recon.tracking.frame import RelativePose
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
 from service.flight.recorder import REPLAYED, Recorder
@@ -40,14 +39,13 @@ def pose(seq: int, of_m: float) -> Pose:
 
 
 def posed(seq: int, of_m: float = 0.1) -> FramePosed:
-    tracked = Tracked(Tracking.TRACKED, 0)
-    return FramePosed(
-        seq, 1_000_000 * seq, tracked, pose(seq, of_m), RelativePose(seq, 0, np.eye(4))
-    )
+    relative = RelativePose(seq, 0, np.eye(4))
+    frame = Frame(NO_IMAGE, 1_000_000 * seq, seq, state=Tracking.TRACKED, relative=relative)
+    return FramePosed(frame, pose(seq, of_m))
 
 
 def lost(seq: int) -> FramePosed:
-    return FramePosed(seq, 1_000_000 * seq, Tracked(Tracking.LOST, 0))
+    return FramePosed(Frame(NO_IMAGE, 1_000_000 * seq, seq, state=Tracking.LOST))
 
 
 class CountingStore(ScanStore):

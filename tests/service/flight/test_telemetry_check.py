@@ -15,12 +15,18 @@ from mavlink.telemetry.latency import LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
 from recon.frames import R_GIMBAL_CAMERA
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.types import F64
 from service.config import CameraConfig
 from service.flight.telemetry_check import AHEAD_NS, TelemetryCheck
 
 S = 1_000_000_000
 LATE_S = 0.07
+
+
+def seen(state: Tracking, T_odom_camera: F64 | None = None, segment: int = 0) -> Frame:
+    at = None if T_odom_camera is None else RelativePose(0, segment, T_odom_camera)
+    return Frame(NO_IMAGE, 0, 0, state=state, segment=segment, relative=at)
 
 
 def body(t: float, strength: float = 1.0) -> Rotation:
@@ -74,7 +80,7 @@ def fly(
         exposed.append(check.exposed_ns(stamp))
         segment = int(gap and k >= 205)
         state = Tracking.LOST if lost else Tracking.TRACKED
-        check.add(stamp, Tracked(state, segment, None if lost else T))
+        check.add(stamp, seen(state, None if lost else T, segment))
     check.finish()
     return exposed
 
@@ -234,7 +240,7 @@ def test_skipped_frames_do_not_interrupt_the_turns_of_the_others() -> None:
     for k in range(40 * 30):
         T = np.eye(4)
         T[:3, :3] = (body(k / 30) * mount).as_matrix() @ R_GIMBAL_CAMERA
-        tracked = Tracked(Tracking.SKIPPED, 0) if k % 3 else Tracked(Tracking.TRACKED, 0, T)
+        tracked = seen(Tracking.SKIPPED) if k % 3 else seen(Tracking.TRACKED, T)
         check.add(round(k * S / 30 + LATE_S * S), tracked)
     check.finish()
     assert check.latency is not None
@@ -254,5 +260,5 @@ def test_the_rest_of_a_long_log_is_not_read_for_each_look(
     camera = CameraConfig(mount="fixed") if gimbal == "none" else CameraConfig()
     check = TelemetryCheck(camera, history_of(gimbal, 1.0))
     for second in range(1, 13):
-        check.add(second * S, Tracked(Tracking.LOST, 0, None))
+        check.add(second * S, seen(Tracking.LOST))
     assert seen_ns == [11 * S + AHEAD_NS]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from service.flight.reports import TrackingWatch
 
 S = 1_000_000_000
@@ -14,7 +14,8 @@ def flown(*states: str) -> list[str]:
     watch = TrackingWatch(reported.append)
     for k, state in enumerate(states):
         reason = {"lost": "too little texture", "waiting": "too little motion"}.get(state, "")
-        watch.look(Tracked(Tracking(state), 0, reason=reason), 100 * S + k * S // 2)
+        frame = Frame(NO_IMAGE, 0, k, state=Tracking(state), reason=reason)
+        watch.look(frame, 100 * S + k * S // 2)
     return reported
 
 

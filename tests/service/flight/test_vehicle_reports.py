@@ -22,8 +22,7 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.pipeline.events import FramePosed
-from recon.tracking.frame import RelativePose
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
 from recon.types import F64, Camera, Pose
 from service.config import CameraConfig, load_config
 from service.daemon.runtime import Daemon
@@ -44,9 +43,12 @@ def posed_at(
 ) -> FramePosed:
     R = R_ENU_NED @ head.as_matrix() @ R_GIMBAL_CAMERA
     T = se3.compose(R, np.array(enu))
-    tracked = Tracked(Tracking.TRACKED, segment, T, tracks=150)
+    frame = Frame(
+        NO_IMAGE, time_ns, 0, state=Tracking.TRACKED, segment=segment,
+        relative=RelativePose(0, segment, T), tracks=150,
+    )  # fmt: skip
     pose = Pose(T, se3.about(-T[:3, 3], COVARIANCE), ("vision",))
-    return FramePosed(0, time_ns, tracked, pose, RelativePose(0, segment, T))
+    return FramePosed(frame, pose)
 
 
 def state() -> VehicleState:
@@ -89,7 +91,7 @@ def test_resets_are_counted_and_lost_frames_left_out() -> None:
     assert sent[-1].velocity_frd_m_s == pytest.approx(BODY.inv().apply([0.0, 10.0, 0.0]))
     report.send(posed_at((10.0, 0.0, 30.0), 7 * S // 10), state())
     assert report.resets == 1
-    lost = FramePosed(0, 8 * S // 10, Tracked(Tracking.LOST, 0))
+    lost = FramePosed(Frame(NO_IMAGE, 8 * S // 10, 0, state=Tracking.LOST))
     report.send(lost, state())
     assert len(sent) == 8
     report.send(posed_at((11.0, 0.0, 30.0), 9 * S // 10, segment=1), state())

@@ -13,7 +13,8 @@ from simulated_place import simulated_place
 from recon import se3
 from recon.backends import load_backend
 from recon.camera_model import rays
-from recon.types import F64, Frame, Keyframe, PosePrior
+from recon.tracking.frame import Frame
+from recon.types import F64, Keyframe, PosePrior
 from service.config import load_config
 from service.flight.pipeline import Pipeline
 from service.sim import shapes
