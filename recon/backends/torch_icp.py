@@ -28,8 +28,8 @@ from recon.mapping.registration import (
     AREA_LAGS,
     AREA_SIGMAS,
     MIN_PARTNERS,
-    Equations,
     IcpConfig,
+    Problem,
     arrays_of,
     conclude,
     no_overlap,
@@ -115,11 +115,11 @@ def _concluded(rows: F64, start: F64, config: IcpConfig) -> Registration:
         partners = np.zeros(1)
     if partners[0] < MIN_PARTNERS:
         return no_overlap(start, int(done[0]))
-    equations = Equations(
+    problem = Problem(
         H.reshape(6, 6), common.reshape(6, 6), g, sums, centre, float(lever[0]),
         lambda: area_of(lags.reshape(2, 3, AREA_LAGS)),
     )  # fmt: skip
-    return conclude(equations, T.reshape(4, 4), start, int(available[0]), int(done[0]), config)
+    return conclude(problem, T.reshape(4, 4), start, int(available[0]), int(done[0]), config)
 
 
 def area_of(lags: F64) -> float:

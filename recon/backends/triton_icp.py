@@ -68,7 +68,7 @@ class SourcePoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """The weighted normal equations, as :class:`recon.mapping.registration.Equations`."""
+    """The weighted normal equations, as :class:`recon.mapping.registration.Problem`."""
 
     H: Tensor  # (6, 6)
     common: Tensor  # (6, 6)

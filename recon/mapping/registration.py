@@ -16,7 +16,7 @@ from recon import se3
 from recon.camera_model import rays
 from recon.mapping import icp_kernels
 from recon.parallel import parallel_for
-from recon.types import F32, F64, Bool, DepthMap, Registration, Verdict
+from recon.types import F32, F64, DepthMap, Registration, Verdict
 
 # Variance that the residuals do not show: edges half seen, errors of the normals; measured.
 _UNSEEN_VARIANCE = 1.5
@@ -99,47 +99,55 @@ class DepthSurface:
         return DepthSurface(elements, intrinsics, centre, max(float(lever), 1e-6))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Equations:
-    """Sums of one iteration over all partners (:mod:`recon.mapping.icp_kernels`)."""
-
-    H: F64  # (6, 6)
-    common: F64  # (6, 6)
-    g: F64  # (6,)
-    sums: F64  # (4,)
-    centre: F64  # (3,) m, target frame
-    lever_m: float
-    area: Callable[[], float]  # neighbours whose residuals err together; takes long
-
-
-@dataclass(slots=True, eq=False)
-class _Problem:
+class Problem:
     """The weighted normal equations of one iteration, rotating about the points' centre."""
 
-    equations: Equations
-    unit: F64  # (6,) turns a twist in metres at the rms lever into rad and m
-    values: F64  # (6,) information along the principal directions
-    vectors: F64  # (6, 6) columns, scaled by ``unit``
-    shared: F64  # (6,) the part of the information that both surfaces agree on
-    gradient: F64  # (6,) along the principal directions
-    strong: Bool  # (6,) directions that the surface determines
+    def __init__(
+        self,
+        H: F64,
+        common: F64,
+        g: F64,
+        sums: F64,
+        centre: F64,
+        lever_m: float,
+        area: Callable[[], float],
+    ) -> None:
+        """The sums over all partners of :func:`recon.mapping.icp_kernels.normal_equations`.
+
+        ``centre`` (3,) m is in the target frame, ``lever_m`` the points' rms distance from it;
+        ``area`` counts neighbours whose residuals err together, and takes long.
+        """
+        self.sums, self.centre, self.area = sums, centre, area
+        # Turns a twist in metres at the rms lever into rad and m.
+        self.unit = np.array([1 / lever_m] * 3 + [1.0] * 3)
+        scale = np.outer(self.unit, self.unit)
+        values, vectors = np.linalg.eigh(H * scale)
+        self.values, self.vectors = values, vectors  # (6,) information along the (6, 6) columns
+        # (6,) the part of the information that both surfaces agree on.
+        self.shared = np.einsum("ik,ij,jk->k", vectors, common * scale, vectors)
+        self.gradient = vectors.T @ (self.unit * g)
+        # The eigenvalues are mean squares of the slope against each motion, 1 for a motion along
+        # all normals. Noise tilts the normals too, but not those of both surfaces alike.
+        enough = WEAK_SLOPE**2 * max(float(values[-1]), 1e-30)
+        # (6,) directions that the surface determines.
+        self.strong = (self.shared > enough) & (self.shared > 0.35 * values)
 
     def moved_m(self, T: F64) -> float:
         """By which ``T`` (4, 4) moves the points' centre."""
-        centre = self.equations.centre
+        centre = self.centre
         return float(np.linalg.norm(T[:3, :3] @ centre + T[:3, 3] - centre))
 
     def step(self) -> F64:
         """(4, 4) left correction in the target frame; weak directions stay put."""
         part = np.where(self.strong, self.gradient / np.maximum(self.values, 1e-30), 0.0)
         twist = self.unit * (-self.vectors @ part)
-        R, centre = se3.so3_exp(twist[:3]), self.equations.centre
+        R, centre = se3.so3_exp(twist[:3]), self.centre
         return se3.compose(R, centre - R @ centre + twist[3:])
 
     def settled(self, step: F64, share: float) -> bool:
         """True when ``step`` moves the points by less than ``share`` of its own sigma."""
         turn = float(np.linalg.norm(se3.so3_log(step[:3, :3]))) / float(self.unit[0])
-        sums = self.equations.sums
+        sums = self.sums
         variance = float(sums[1]) / max(float(sums[0]), 1.0)
         sigma = np.sqrt(variance / max(float(self.values[self.strong].min(initial=1e30)), 1e-30))
         return max(self.moved_m(step), turn) < max(share * float(sigma), 1e-7)
@@ -147,7 +155,7 @@ class _Problem:
 
 def _problem(
     source: DepthSurface, target: DepthSurface, T: F64, stride: int, tukey: bool
-) -> _Problem | None:
+) -> Problem | None:
     """The problem at ``T``, or None when fewer than :data:`MIN_PARTNERS` points find a partner."""
     h, w = source.elements.shape[:2]
     shape = (h - stride // 2 - 1) // stride + 1, (w - stride // 2 - 1) // stride + 1
@@ -169,31 +177,16 @@ def _problem(
     def area() -> float:
         return float(icp_kernels.correlated_area(size, AREA_SIGMAS * scale, AREA_LAGS))
 
-    equations = Equations(H, common, g, sums, centre, source.lever_m, area)
-    return _along_directions(equations)
-
-
-def _along_directions(equations: Equations) -> _Problem:
-    """The problem in its principal directions."""
-    H, common, g, lever_m = equations.H, equations.common, equations.g, equations.lever_m
-    unit = np.array([1 / lever_m] * 3 + [1.0] * 3)
-    values, vectors = np.linalg.eigh(H * np.outer(unit, unit))
-    shared = np.einsum("ik,ij,jk->k", vectors, common * np.outer(unit, unit), vectors)
-    # The eigenvalues are mean squares of the slope against each motion, 1 for a motion along
-    # all normals. Noise tilts the normals too, but not those of both surfaces alike.
-    enough = WEAK_SLOPE**2 * max(float(values[-1]), 1e-30)
-    strong = (shared > enough) & (shared > 0.35 * values)
-    return _Problem(equations, unit, values, vectors, shared, vectors.T @ (unit * g), strong)
+    return Problem(H, common, g, sums, centre, source.lever_m, area)
 
 
 def conclude(
-    equations: Equations, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
+    problem: Problem, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
 ) -> Registration:
     """The registration after a last step from ``T`` (4, 4), for a search made elsewhere.
 
     ``available`` counts the source's surface elements.
     """
-    problem = _along_directions(equations)
     return _judged(problem, problem.step() @ T, T_start, available, iterations + 1, config)
 
 
@@ -212,7 +205,7 @@ def register_projective(
     T = np.array(T_target_source, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise ValueError("T_target_source must be (4, 4) finite numbers")
-    problem: _Problem | None = None
+    problem: Problem | None = None
     done = 0
     last = len(config.strides) - 1
     for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
@@ -247,10 +240,10 @@ def no_overlap(T: F64, iterations: int) -> Registration:
 
 
 def _judged(
-    problem: _Problem, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
+    problem: Problem, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
 ) -> Registration:
     covariance = _covariance(problem)
-    sums, depth = problem.equations.sums, float(problem.equations.centre[2])
+    sums, depth = problem.sums, float(problem.centre[2])
     rms = float(np.sqrt(sums[3] / max(sums[0], 1e-9)))
     share = float(sums[2]) / max(available, 1)
     change = T @ se3.inverse(T_start)
@@ -267,16 +260,16 @@ def _judged(
     return Registration(T, covariance, verdict, rms, share, iterations)
 
 
-def _covariance(problem: _Problem) -> F64:
+def _covariance(problem: Problem) -> F64:
     """(6, 6) covariance of a left perturbation."""
-    weights, squares = (float(s) for s in problem.equations.sums[:2])
+    weights, squares = (float(s) for s in problem.sums[:2])
     # Residuals of neighbours err together, so they count as fewer than they are.
-    area = problem.equations.area()
+    area = problem.area()
     variance = max(squares / max(weights - 6.0, 1.0), 1e-6) * area * _UNSEEN_VARIANCE
     # Information from noise in the normals is none: only the shared part moves the estimate.
     information = np.maximum(problem.shared, 1e-30) ** 2 / np.maximum(problem.values, 1e-30)
     spread = np.where(problem.strong, variance / information, UNKNOWN_SIGMA_M**2)
     # The rotation was about the centre; a left perturbation turns about the origin.
-    move = se3.adjoint(se3.compose(np.eye(3), problem.equations.centre))
+    move = se3.adjoint(se3.compose(np.eye(3), problem.centre))
     directions = move @ (problem.unit[:, None] * problem.vectors)
     return np.asarray((directions * spread) @ directions.T)

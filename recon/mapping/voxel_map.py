@@ -28,22 +28,15 @@ LARGEST_INDEX = _OFFSET - 1
 """Voxel indices reach this far from the origin on each axis; points beyond are left out."""
 
 
-@dataclass(frozen=True, slots=True)
-class VoxelMapConfig:
-    """The map's resolution, and when surface counts as better.
+BETTER_RATIO = 1.5
+"""Surface is better when its sigma, times this, is still below the held one."""
 
-    ``voxel_m`` of about twice the ground sample distance keeps the gaps between the pixels of
-    two keyframes from looking like new surface.
-    """
+REACH_SIGMA, LARGEST_REACH = 2.0, 6
+"""Held surface within so many sigma along the pixel's ray is the same surface, so many voxels away
+at most."""
 
-    voxel_m: float = 0.25
-    better_ratio: float = 1.5
-    """Surface is better when its sigma, times this, is still below the held one."""
-    reach_sigma: float = 2.0
-    """Held surface within this many sigma along the pixel's ray is the same surface."""
-    largest_reach_voxels: int = 6
-    largest_voxels: int = 8_000_000
-    """Above this the half seen longest ago is dropped (and would be sent again)."""
+LARGEST_VOXELS = 8_000_000
+"""Above this the half seen longest ago is dropped (and would be sent again)."""
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -144,8 +137,10 @@ class VoxelMap:
     a known roof into the next voxel does not make it new.
     """
 
-    def __init__(self, config: VoxelMapConfig | None = None) -> None:
-        self.config = config or VoxelMapConfig()
+    def __init__(self, voxel_m: float, largest_voxels: int = LARGEST_VOXELS) -> None:
+        """``voxel_m`` of about twice the ground sample distance keeps the gaps between the pixels
+        of two keyframes from looking like new surface."""
+        self.voxel_m, self._largest_voxels = voxel_m, largest_voxels
         self._turn = 0
         self._count: int = 0
         self._clear()
@@ -162,11 +157,10 @@ class VoxelMap:
 
     def fresh(self, depth: DepthMap) -> Bool:
         """(h, w) pixels whose surface is new, or clearly better than what is held."""
-        c = self.config
         out = np.zeros(depth.depth_m.shape, np.bool_)
         parallel_for(
             _fresh, len(out), self._keys, self._ids, self._sigma, *_arrays(depth),
-            1.0 / c.voxel_m, c.better_ratio, c.reach_sigma, c.largest_reach_voxels, out,
+            1.0 / self.voxel_m, BETTER_RATIO, REACH_SIGMA, LARGEST_REACH, out,
         )  # fmt: skip
         return out
 
@@ -174,7 +168,7 @@ class VoxelMap:
         """Remember the surface of ``depth``, where ``mask`` if given; how many voxels are new."""
         mask_ = np.ones(depth.depth_m.shape, np.bool_) if mask is None else mask
         self._turn += 1
-        if self._count > self.config.largest_voxels:
+        if self._count > self._largest_voxels:
             self._forget_half()
         self._make_room(int(np.count_nonzero(mask_)))
         before = self._count
@@ -188,7 +182,7 @@ class VoxelMap:
                 self._turn,
                 *_arrays(depth),
                 mask_,
-                1.0 / self.config.voxel_m,
+                1.0 / self.voxel_m,
             )
         )
         return self._count - before

@@ -18,7 +18,7 @@ from recon.backends import Backend, DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.exposure_compensation import ExposureCompensation
-from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
+from recon.mapping.voxel_map import VoxelMap, ground_sample_m
 from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import FramePoses
@@ -101,7 +101,7 @@ class Mapper:
         config: MapperConfig | None = None,
         backend: Backend | None = None,
         known: AdjustedTrack | None = None,
-        new_map: Callable[[VoxelMapConfig], VoxelMap] = VoxelMap,
+        new_map: Callable[[float], VoxelMap] = VoxelMap,
         worker: Callable[[Reconstruct], Worker] = InTurn,
         timing: Timing = untimed,
         keeps_cloud: bool = True,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from recon.mapping.disagreement import Disagreement
-from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from recon.mapping.voxel_map import VoxelMap
 from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import F32, F64, Bool, DepthMap
 
@@ -29,7 +29,7 @@ class SurfaceMap:
         focal_px: float,
         placed: Callable[[Sequence[int]], F64],
         resolution_m: float = 0.0,
-        new_map: Callable[[VoxelMapConfig], VoxelMap] = VoxelMap,
+        new_map: Callable[[float], VoxelMap] = VoxelMap,
     ) -> None:
         """``focal_px`` is of the recorded images, ``placed`` as
         :meth:`recon.posegraph.trajectory.Trajectory.similarities`; ``new_map`` makes the empty
@@ -78,8 +78,7 @@ class SurfaceMap:
     def _empty(self, depth: DepthMap) -> VoxelMap:
         """A map as fine as the first view."""
         ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
-        voxel_m = max(2.0 * ground_m, self._resolution_m, 1e-3)
-        return self._new_map(VoxelMapConfig(voxel_m=voxel_m))
+        return self._new_map(max(2.0 * ground_m, self._resolution_m, 1e-3))
 
     def clear(self) -> None:
         known, self.known = self.known, None

@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import logging
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
+from recon.mapping.voxel_map import (
+    LARGEST_REACH,
+    LARGEST_VOXELS,
+    VoxelMap,
+    Voxels,
+    tile_of,
+    tiles_under,
+)
 from recon.types import I64, Bool, DepthMap
 
 log = logging.getLogger(__name__)
@@ -32,13 +38,12 @@ class PagedMap(VoxelMap):
     it is full, and that surface is sent again.
     """
 
-    def __init__(self, config: VoxelMapConfig, folder: Path, max_voxels: int = 2_000_000) -> None:
+    def __init__(self, voxel_m: float, folder: Path, max_voxels: int = 2_000_000) -> None:
         if max_voxels < 1000:
             raise ValueError(f"max_voxels is {max_voxels}, must be at least 1000")
         self.folder, self.max_voxels = folder, max_voxels
-        largest = min(config.largest_voxels, MAX_OVER * max_voxels)
-        super().__init__(replace(config, largest_voxels=largest))
-        self._margin_m = config.voxel_m * (config.largest_reach_voxels + 1)
+        super().__init__(voxel_m, min(LARGEST_VOXELS, MAX_OVER * max_voxels))
+        self._margin_m = voxel_m * (LARGEST_REACH + 1)
         self._away: set[int] = set()  # tiles that are on disk
         self._broken = False
 
@@ -67,7 +72,7 @@ class PagedMap(VoxelMap):
         self._away.clear()
 
     def _under(self, depth: DepthMap) -> I64:
-        return tiles_under(depth, self.config.voxel_m, self._margin_m)
+        return tiles_under(depth, self.voxel_m, self._margin_m)
 
     def _bring_back(self, tiles: I64) -> None:
         for tile in self._away.intersection(tiles.tolist()):

@@ -10,7 +10,7 @@ import numpy as np
 from recon import se3
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.free_space import seen_through
-from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from recon.mapping.voxel_map import VoxelMap
 from recon.types import Array, DepthMap, PointCloud
 from service.bench import BenchOptions, BenchResult, compare
 
@@ -50,7 +50,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
 
 def _map(depths: list[DepthMap], clouds: list[PointCloud], options: BenchOptions) -> BenchResult:
     """Fresh pixels and their insertion, against the same question to a sorted NumPy set."""
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=0.5))
+    voxel_map = VoxelMap(0.5)
     for depth in depths:
         voxel_map.insert(depth, voxel_map.fresh(depth))
     held = np.unique(np.concatenate([_keys(cloud) for cloud in clouds]))
@@ -81,7 +81,7 @@ def _keys(cloud: PointCloud, voxel_m: float = 0.5) -> Array:
 
 def _growth() -> BenchResult:
     """Memory of the map after a flight of two kilometres."""
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=0.5))
+    voxel_map = VoxelMap(0.5)
     for k in range(LONG_FLIGHT):
         depth = keyframe_depth(5.0 * k, k)
         voxel_map.insert(depth, voxel_map.fresh(depth))

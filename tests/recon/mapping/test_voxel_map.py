@@ -10,7 +10,7 @@ import pytest
 
 from recon import se3
 from recon.mapping.cloud_fusion import CORRELATION, cloud_of, fuse, fuse_strips
-from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
+from recon.mapping.voxel_map import VoxelMap, ground_sample_m
 from recon.types import F64, Bool, DepthMap, PointCloud
 
 K = np.array([[100.0, 0.0, 79.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])
@@ -52,7 +52,7 @@ def cloud(xyz: list[list[float]], sigma: list[float], views: list[int] | None = 
 
 def test_inserts_as_many_voxels_as_a_set_of_indices() -> None:
     depth = view(0.0, roof_m=6.0)
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=0.7))
+    voxel_map = VoxelMap(0.7)
     new = voxel_map.insert(depth)
     indices = np.floor(world_points(depth).reshape(-1, 3) / 0.7).astype(int)
     assert new == len(voxel_map) == len({tuple(i) for i in indices})
@@ -61,7 +61,7 @@ def test_inserts_as_many_voxels_as_a_set_of_indices() -> None:
 
 def test_known_surface_needs_no_more_memory() -> None:
     depth = view(0.0, roof_m=6.0)
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=5.0))
+    voxel_map = VoxelMap(5.0)
     voxel_map.insert(depth)
     held = voxel_map.nbytes
     many = replace(depth, depth_m=np.tile(depth.depth_m, (8, 8)))
@@ -74,7 +74,7 @@ def test_known_surface_needs_no_more_memory() -> None:
 
 def test_all_is_fresh_before_and_nothing_after() -> None:
     depth = view(0.0, roof_m=6.0)
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=1.0))
+    voxel_map = VoxelMap(1.0)
     assert voxel_map.fresh(depth).all()
     voxel_map.insert(depth)
     assert not voxel_map.fresh(depth).any()
@@ -82,7 +82,7 @@ def test_all_is_fresh_before_and_nothing_after() -> None:
 
 @pytest.mark.parametrize("shift_m", [10.0, 40.0])
 def test_only_the_strip_not_seen_before_is_fresh(shift_m: float) -> None:
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=1.0))
+    voxel_map = VoxelMap(1.0)
     voxel_map.insert(view(0.0))
     second = view(shift_m)
     fresh = voxel_map.fresh(second)
@@ -95,7 +95,7 @@ def test_only_the_strip_not_seen_before_is_fresh(shift_m: float) -> None:
 
 
 def test_clearly_better_surface_is_fresh_and_slightly_better_is_not() -> None:
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=1.0, better_ratio=1.5))
+    voxel_map = VoxelMap(1.0)
     voxel_map.insert(view(0.0, sigma_m=0.3))
     assert not voxel_map.fresh(view(0.0, sigma_m=0.25)).any()
     assert voxel_map.fresh(view(0.0, sigma_m=0.19)).all()
@@ -104,7 +104,7 @@ def test_clearly_better_surface_is_fresh_and_slightly_better_is_not() -> None:
 
 
 def test_noise_within_sigma_is_not_new_surface_but_a_roof_is() -> None:
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=0.5))
+    voxel_map = VoxelMap(0.5)
     voxel_map.insert(view(0.0, sigma_m=0.4))
     rng = np.random.default_rng(0)
     noisy = view(0.0, sigma_m=0.4)
@@ -119,7 +119,7 @@ def test_unknown_pixels_are_neither_fresh_nor_inserted() -> None:
     depth = view(0.0)
     depth.depth_m[:45] = np.nan
     depth.sigma_m[45:50] = np.nan
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=1.0))
+    voxel_map = VoxelMap(1.0)
     fresh = voxel_map.fresh(depth)
     assert not fresh[:50].any()
     assert fresh[50:].all()
@@ -131,7 +131,7 @@ def test_insert_takes_only_the_masked_pixels() -> None:
     depth = view(0.0)
     mask: Bool = np.zeros(depth.depth_m.shape, np.bool_)
     mask[:, :40] = True
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=1.0))
+    voxel_map = VoxelMap(1.0)
     voxel_map.insert(depth, mask)
     fresh = voxel_map.fresh(depth)
     assert not fresh[:, :40].any()
@@ -139,7 +139,7 @@ def test_insert_takes_only_the_masked_pixels() -> None:
 
 
 def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=0.5, largest_voxels=40_000))
+    voxel_map = VoxelMap(0.5, 40_000)
     for k in range(12):
         voxel_map.insert(view(80.0 * k))
     assert len(voxel_map) < 40_000 + 90 * 160
@@ -150,7 +150,7 @@ def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
 def test_far_and_broken_poses_do_no_harm() -> None:
     depth = view(0.0)
     broken = DepthMap(depth.depth_m, depth.sigma_m, depth.views, K, depth.T_world_camera * np.nan)
-    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=0.5))
+    voxel_map = VoxelMap(0.5)
     assert voxel_map.insert(view(1e7)) == 0
     assert voxel_map.insert(broken) == 0
     assert not voxel_map.fresh(broken).any()

@@ -11,7 +11,7 @@ import pytest
 from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.mapping.disagreement import MIN_FACTOR
-from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
+from recon.mapping.voxel_map import VoxelMap, tiles_under
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import KNOWN_ROWS
 from recon.types import F64, Camera, DepthMap, PosePrior
@@ -21,7 +21,7 @@ from service.flight.pipeline import Pipeline
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-CONFIG = VoxelMapConfig(voxel_m=0.5)
+VOXEL_M = 0.5
 
 
 def view(east_m: float, north_m: float = 0.0, sigma_m: float = 0.2) -> DepthMap:
@@ -47,7 +47,7 @@ def survey() -> list[DepthMap]:
 
 
 def test_pages_change_no_answer(tmp_path: Path) -> None:
-    whole, paged = VoxelMap(CONFIG), PagedMap(CONFIG, tmp_path / "pages", max_voxels=20_000)
+    whole, paged = VoxelMap(VOXEL_M), PagedMap(VOXEL_M, tmp_path / "pages", max_voxels=20_000)
     max_on_disk = largest = 0
     for depth in survey():
         expected = whole.fresh(depth)
@@ -62,7 +62,7 @@ def test_pages_change_no_answer(tmp_path: Path) -> None:
 
 
 def test_a_damaged_page_makes_its_ground_new_and_nothing_else(tmp_path: Path) -> None:
-    paged = PagedMap(CONFIG, tmp_path, max_voxels=20_000)
+    paged = PagedMap(VOXEL_M, tmp_path, max_voxels=20_000)
     for depth in survey()[:40]:
         paged.insert(depth)
     assert paged.tiles_on_disk > 0
@@ -75,7 +75,7 @@ def test_a_damaged_page_makes_its_ground_new_and_nothing_else(tmp_path: Path) ->
 def test_a_disk_that_takes_no_pages_keeps_the_map_in_memory(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    paged = PagedMap(CONFIG, blocked / "pages", max_voxels=20_000)
+    paged = PagedMap(VOXEL_M, blocked / "pages", max_voxels=20_000)
     for depth in survey()[:40]:
         paged.insert(depth)
     assert paged.tiles_on_disk == 0 and not paged.fresh(view(0.0)).any()
@@ -83,7 +83,7 @@ def test_a_disk_that_takes_no_pages_keeps_the_map_in_memory(tmp_path: Path) -> N
 
 def test_more_and_more_surface_under_one_view_is_bounded(tmp_path: Path) -> None:
     """A map that drifts lays surface over surface where the drone hovers."""
-    paged = PagedMap(CONFIG, tmp_path, max_voxels=2_000)
+    paged = PagedMap(VOXEL_M, tmp_path, max_voxels=2_000)
     held = []
     for n in range(40):
         depth = view(0.0)
@@ -96,7 +96,7 @@ def test_more_and_more_surface_under_one_view_is_bounded(tmp_path: Path) -> None
 
 def test_tiles_under_a_view_hold_all_of_its_voxels() -> None:
     depth = view(-40.0, 13.0)
-    voxel_map = VoxelMap(CONFIG)
+    voxel_map = VoxelMap(VOXEL_M)
     voxel_map.insert(depth)
     tiles, counts = voxel_map.oldest_tiles()
     assert set(tiles.tolist()) <= set(tiles_under(depth, 0.5, 1.0).tolist())
@@ -129,7 +129,7 @@ def test_pages_of_a_map_that_begins_at_the_very_end_are_removed(
 
 def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="max_voxels"):
-        PagedMap(CONFIG, tmp_path, max_voxels=10)
+        PagedMap(VOXEL_M, tmp_path, max_voxels=10)
 
 
 def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later() -> None:
