@@ -201,7 +201,7 @@ def _fly(
     link = open_datalink(store, inputs.config)
     unsure = unsure if link is None else ()
     scan = Scan(inputs, store)
-    scan.pipeline.end_by(stop, PATIENCE_S)
+    scan.worker.end_by(stop, PATIENCE_S)
     correction = None
     try:
         work = "tracking and reconstructing"

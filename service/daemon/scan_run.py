@@ -63,7 +63,7 @@ class ScanRun:
         scan, gate = self.scan, self.gate
         if scan is None or gate is None or not self.is_feeding:
             return 0.0
-        return max(gate.busy_s, scan.pipeline.busy_s)
+        return max(gate.busy_s, scan.worker.busy_s)
 
     def alive(self) -> None:
         self.progress_s = self.clock_s()
@@ -95,9 +95,7 @@ class ScanRun:
         """Use the live keys of ``config``, reduced to a load level."""
         scan, gate = self.scan, self.gate
         if scan is not None and gate is not None:
-            scan.pipeline.configure_baseline(config.scan)
-            scan.check.set_camera(config.camera)
-            scan.pipeline.configure_effort(lowered(config.compute, level))
+            scan.configure(config, lowered(config.compute, level))
             gate.level = level
 
     def lag(self) -> MachineReadings:
@@ -105,7 +103,7 @@ class ScanRun:
         scan, gate = self.scan, self.gate
         if scan is None or gate is None:
             return MachineReadings()
-        dropped, late = scan.pipeline.dropped, gate.late
+        dropped, late = scan.worker.dropped, gate.late
         counted = scan.recorder.keyframes + dropped, dropped, gate.frames + late, late
         views, late_views, frames, late_frames = map(sub, counted, self._counted)
         self._counted = counted
@@ -122,7 +120,7 @@ class ScanRun:
         return {
             "frame_age_s": round(gate.age_s, 3),
             "frames_late": gate.late,
-            "views_late": scan.pipeline.dropped,
+            "views_late": scan.worker.dropped,
             "pictures_kept": gate.kept,
             "pictures_lost": gate.lost,
         }

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from functools import partial
 from pathlib import Path
-from threading import Event
 
 from recon.backends import Backend
 from recon.parallel import limit_threads
@@ -16,7 +15,7 @@ from recon.tracking.adjusted_track import AdjustedTrack
 from recon.types import Camera
 from service.background import BackgroundWorker
 from service.cameras.camera_file import seeks_readout, with_shutter
-from service.config import ComputeConfig, Config, ScanConfig, parse_baseline
+from service.config import Config, ScanConfig, parse_baseline
 from service.flight.paged_map import PagedMap
 from service.flight.reports import GraphWatch
 from service.progress import Stopwatch
@@ -31,13 +30,17 @@ def counts(view: StereoView) -> bool:
     return not view.is_first_depth
 
 
+def baseline_of(scan: ScanConfig) -> Baseline:
+    return Baseline(*parse_baseline(scan.baseline))
+
+
 def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperConfig:
     """The mapper's parameters by the configuration; ``live`` for a flight that can be followed."""
     compute, scan, link = config.compute, config.scan, config.datalink
     is_sent = live and bool(link.connect or link.listen)
     is_sent = is_sent and 125.0 * link.budget_kbit_s * link.share >= FIRST_BYTES_S
     return MapperConfig(
-        baseline=Baseline(*parse_baseline(scan.baseline)),
+        baseline=baseline_of(scan),
         pairs=compute.pairs,
         base_to_height=scan.base_to_height,
         seeks_readout=seeks_readout(camera, config.camera),
@@ -94,8 +97,8 @@ class Pipeline:
         self, row: str | None, live: bool, work: Reconstruct
     ) -> BackgroundWorker[StereoView, Reconstructed]:
         watched = partial(self._watched, work)
-        self._background = BackgroundWorker(row, watched, MAX_WAITING, live, counts)
-        return self._background
+        self.worker = BackgroundWorker(row, watched, MAX_WAITING, live, counts)
+        return self.worker
 
     def _watched(self, work: Reconstruct, view: StereoView) -> Reconstructed:
         """Do the work, and examine the graph now and then."""
@@ -106,32 +109,6 @@ class Pipeline:
     def new_doubts(self) -> list[str]:
         """Warnings about the telemetry, each once."""
         return [self._doubts.popleft() for _ in range(len(self._doubts))]
-
-    def end_by(self, stop: Event, patience_s: float) -> None:
-        """Drop unfinished reconstructions, at most ``patience_s`` after ``stop`` is set."""
-        self._background.end_by(stop, patience_s)
-
-    # ---- in flight ---------------------------------------------------------------------
-
-    def configure_baseline(self, scan: ScanConfig) -> None:
-        """Apply a new ``scan.baseline`` from the next frame on."""
-        self.mapper.set_baseline(Baseline(*parse_baseline(scan.baseline)))
-
-    def configure_effort(self, compute: ComputeConfig) -> None:
-        """Apply new ``pairs``, ``stereo_width`` and ``upsample`` from the next view on."""
-        self.mapper.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
-
-    # ---- figures -----------------------------------------------------------------------
-
-    @property
-    def dropped(self) -> int:
-        """Views that were not reconstructed because newer ones arrived faster."""
-        return self._background.dropped
-
-    @property
-    def busy_s(self) -> float:
-        """Seconds for which one view has been under reconstruction; 0 when none is."""
-        return self._background.busy_s
 
     @property
     def held(self) -> dict[str, int]:

@@ -178,7 +178,8 @@ class Recorder:
 
     def _drops(self) -> dict[str, int]:
         """Unused frames and views, by reason."""
-        late = {"newer views came faster": self.pipeline.dropped} if self.pipeline.dropped else {}
+        dropped = self.pipeline.worker.dropped
+        late = {"newer views came faster": dropped} if dropped else {}
         return dict(self.mapper.refusals()) | late
 
     def _scale(self) -> dict[str, Any]:

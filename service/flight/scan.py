@@ -29,9 +29,9 @@ from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.lens import MAX_FOCAL
 from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame, CameraSource, ahead
-from service.config import Config
+from service.config import ComputeConfig, Config
 from service.errors import InputError
-from service.flight.pipeline import Pipeline
+from service.flight.pipeline import Pipeline, baseline_of
 from service.flight.recorder import REPLAYED, TAGS_FILE, FrameTags, Recorder
 from service.flight.reports import ShutterWatch, TrackingWatch
 from service.flight.telemetry_check import TelemetryCheck
@@ -132,7 +132,7 @@ class Scan:
         self.pipeline = Pipeline(
             inputs.camera, config, inputs.backend, pages, live=live, known=inputs.known
         )  # fmt: skip
-        self.mapper = self.pipeline.mapper
+        self.mapper, self.worker = self.pipeline.mapper, self.pipeline.worker
         self.rig = Rig(config.camera, config.scan, config.fusion)
         self._velocity = VelocityIntegrator()
         self.recorder = Recorder(
@@ -154,6 +154,12 @@ class Scan:
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
         self._photos: deque[None] = deque()  # one for each that was asked for
         self._started = time.monotonic()
+
+    def configure(self, config: Config, compute: ComputeConfig) -> None:
+        """Apply the keys of ``config`` that change in flight, with the ``compute`` of its load."""
+        self.check.set_camera(config.camera)
+        self.mapper.set_baseline(baseline_of(config.scan))  # from the next frame on
+        self.mapper.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
 
     def take_photo(self) -> None:
         """Hand out the next frame as a photo; it becomes a keyframe where it has partners."""
