@@ -183,14 +183,10 @@ class Localiser:
         if ok.sum() < 2 * MIN_TRACKS:
             return None
         turn = prediction.relative_rotation(key.prior, new.prior)
-        largest = np.pi if turn is None else MAX_TILT_ERROR_RAD
-        up, K = key.T_camera_odom[:3, 2], self.camera.K
-        far = np.full(int(ok.sum()), np.nan_to_num(1.0 / median_depth(key)))
-        uv_a = key.row_motion.at_middle(K, key.uv[ok], far)
-        uv_b = new.row_motion.at_middle(K, uv[ok], far)
-        seen = two_view.solve(uv_a, uv_b, K, turn, largest, up)
-        if seen is None and turn is not None:  # tags are often wrong
-            seen = two_view.solve(uv_a, uv_b, K, None, np.pi, up)
+        inverse_depth = float(np.nan_to_num(1.0 / median_depth(key)))
+        seen = self.motion_since(
+            key, new, uv, ok, inverse_depth, turn, MAX_TILT_ERROR_RAD, may_be_wrong=True
+        )
         if seen is None or seen.parallax_rad < MIN_BASE_TO_HEIGHT:
             return None
         rows = np.flatnonzero(ok)[seen.inliers]
@@ -204,6 +200,25 @@ class Localiser:
         good = np.zeros(len(ok), np.bool_)
         good[rows] = True
         return key, step @ key.T_camera_odom, uv, good
+
+    def motion_since(
+        self, key: OdometryKeyframe, new: Frame, uv: F64, ok: Bool, inverse_depth: float,
+        R_b_a: F64 | None, max_turn_rad: float, may_be_wrong: bool,
+    ) -> two_view.TwoView | None:  # fmt: skip
+        """The motion since a keyframe, whose corners are at ``uv`` (N, 2) where ``ok`` (N,).
+
+        It turns by no more than ``max_turn_rad`` otherwise than telemetry (3, 3) says, unless that
+        ``may_be_wrong``, as tags often are. Rows were read at an ``inverse_depth`` of level ground.
+        """
+        K, up = self.camera.K, key.T_camera_odom[:3, 2]
+        far = np.full(int(ok.sum()), inverse_depth)
+        uv_a = key.row_motion.at_middle(K, key.uv[ok], far)
+        uv_b = new.row_motion.at_middle(K, uv[ok], far)
+        if R_b_a is not None:
+            view = two_view.solve(uv_a, uv_b, K, R_b_a, max_turn_rad, up)
+            if view is not None or not may_be_wrong:
+                return view
+        return two_view.solve(uv_a, uv_b, K, None, np.pi, up)
 
     def _starts(
         self,

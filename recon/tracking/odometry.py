@@ -250,7 +250,10 @@ class Odometry:
         moved = prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
         view = None
         if moved >= least or (R_b_a is None and self._is_no_turn(first.uv[ok], uv[ok])):
-            view = self._motion_of_two(new, uv, ok, R_b_a)
+            inverse_depth = 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0
+            view = self._localiser.motion_since(
+                first, new, uv, ok, inverse_depth, R_b_a, 0.12, may_be_wrong=self._low_frame_rate
+            )
         if moved < least and (view is None or view.parallax_rad < least):
             if self._row_track.is_known and len(self._early) < EARLY:
                 self._early.append((new.row_motion, uv, ok))
@@ -271,21 +274,6 @@ class Odometry:
         """
         off_px = float(self.K[0, 0]) * prediction.beyond_turn(uv_a, uv_b, self.K)
         return off_px > 2.0 * two_view.MAX_ERROR_PX
-
-    def _motion_of_two(
-        self, new: Frame, uv: F64, ok: Bool, R_b_a: F64 | None
-    ) -> two_view.TwoView | None:
-        """The motion since the first frame, whose corners are at ``uv`` (N, 2) where ``ok``."""
-        first = self.keyframes[0]
-        up_a = first.T_camera_odom[:3, 2]
-        turn = 0.12 if R_b_a is not None else np.pi
-        far = np.full(int(ok.sum()), 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0)
-        uv_a = first.row_motion.at_middle(self.K, first.uv[ok], far)
-        uv_b = new.row_motion.at_middle(self.K, uv[ok], far)
-        view = two_view.solve(uv_a, uv_b, self.K, R_b_a, turn, up_a)
-        if view is None and R_b_a is not None and self._low_frame_rate:  # tags are often wrong
-            view = two_view.solve(uv_a, uv_b, self.K, None, np.pi, up_a)
-        return view
 
     def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
         """Enter the two-view points into the table; return metres per unit of the baseline."""
@@ -335,12 +323,10 @@ class Odometry:
         seen = [found]
         if self._low_frame_rate:  # little overlap: every keyframe that sees the same ground counts
             seen += self._localiser.others(new, self.keyframes, found)
-        self._add_keyframe(
-            new, found.pose.T_camera_points, [(other.key, other.uv, other.ok) for other in seen]
-        )
+        corners = [(other.key, other.uv, other.ok) for other in seen]
+        placed = self._add_keyframe(new, found.pose.T_camera_points, corners)
         self._motion_model.correct(self.keyframes[-1].T_odom_camera)
-        newest = self.keyframes[-1].T_odom_camera
-        return self._found(new, Tracking.KEYFRAME, newest, int(found.ok.sum()))
+        return placed
 
     def _px_s(self, T_odom_camera: F64, depth: float) -> F64:
         """(2,) motion of the image since the frame before; zero for stills, which are far apart."""
@@ -353,17 +339,16 @@ class Odometry:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
         key, T_camera_odom, uv, ok = found
-        self._add_keyframe(new, T_camera_odom, [(key, uv, ok)])
+        placed = self._add_keyframe(new, T_camera_odom, [(key, uv, ok)])
         self._motion_model.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
-        newest = self.keyframes[-1].T_odom_camera
-        return self._found(new, Tracking.KEYFRAME, newest, int(ok.sum()))
+        return placed
 
     def _add_keyframe(
         self,
         new: Frame,
         T_camera_odom: F64,
         seen: list[tuple[OdometryKeyframe, F64, Bool]],
-    ) -> None:
+    ) -> Frame:
         """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window.
 
         ``seen`` are keyframes with where (N, 2) their corners were found and which (N,) were,
@@ -393,6 +378,7 @@ class Odometry:
             self.focal.add(*adjusted)
         self._depth = median_depth(key_new)
         self._forget()
+        return self._found(new, Tracking.KEYFRAME, key_new.T_odom_camera, int(seen[0][2].sum()))
 
     def _settle(self) -> None:
         """Adjust the window again once frames after its last keyframe say how its rows moved, and

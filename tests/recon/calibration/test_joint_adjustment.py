@@ -230,9 +230,9 @@ def test_drawn_stills_that_come_late_with_a_slow_log(tmp_path: Path) -> None:
     assert np.median(np.abs(heights - np.median(heights))) < 0.002 * HEIGHT_M
     gray, rolls = np.zeros(SIZE[::-1], np.uint8), []
     for seq, t in enumerate(times()):
-        row_motion = found.known.track(undistorted(gray, seq, 0, PosePrior())).row_motion
-        assert row_motion.rows is not None
-        rolls.append(row_motion.rows.rate[0] - rate_at(t)[0])
+        (frame,) = found.known.track(undistorted(gray, seq, 0, PosePrior()))
+        assert frame.row_motion.rows is not None
+        rolls.append(frame.row_motion.rows.rate[0] - rate_at(t)[0])
     assert abs(np.degrees(np.mean(rolls))) < 2.0  # hardly shows over flat ground
 
 

@@ -311,11 +311,11 @@ def test_a_few_landmarks_show_where_the_others_are(
         return at(self, level, uv_b, active, reach)
 
     monkeypatch.setattr(matching._Search, "at", counted)
-    odometry, rng, out = Odometry(CAMERA), np.random.default_rng(2), []
+    odometry, rng, out = Odometry(CAMERA), np.random.default_rng(2), list[Frame]()
     for i, T in enumerate(poses(20)):
         searched.append(0)
-        out.append(
-            odometry.track(undistorted(photograph(ground, T), i, i * 200_000_000, prior_of(T, rng)))
+        out += odometry.track(
+            undistorted(photograph(ground, T), i, i * 200_000_000, prior_of(T, rng))
         )
     between = [n for n, one in zip(searched, out, strict=True) if one.state is Tracking.TRACKED]
     assert len(between) > 8

@@ -181,7 +181,7 @@ def test_rows_of_a_field_are_not_taken_for_one_another() -> None:
     track = [pose(0.45 * FOOTPRINT_M * i, 3.0 * i, seed=i) for i in range(3)]
     odometry, prior = Odometry(camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
     found = [
-        odometry.track(undistorted(still(T, camera, ground), i, i * 2_000_000_000, prior))
+        odometry.track(undistorted(still(T, camera, ground), i, i * 2_000_000_000, prior))[-1]
         for i, T in enumerate(track)
     ]
     assert_one_piece(track, found, 0.02)
