@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from recon.parallel import parallel_for
-from recon.types import F32, F64, I16, I64, U8, Bool, DepthMap, PointCloud
+from recon.types import F32, F64, I16, I64, U8, Array, Bool, DepthMap, PointCloud
 
 U32 = npt.NDArray[np.uint32]
 
@@ -73,6 +73,18 @@ class Tiles:
         middle, half = self._middle + up * (low + high), self._half + up * (high - low)
         reach = middle @ planes[:, :3].T + half @ np.abs(planes[:, :3]).T + planes[:, 3]
         return np.flatnonzero((reach >= 0.0).all(axis=1) & ~self.is_decided)
+
+    def look(self, kernel: Any, depth: DepthMap, reached: I64, *arrays: Array) -> None:
+        """Run a compiled ``kernel`` on the tiles that are ``reached``, with a keyframe's depth,
+        sigma and camera, and with ``arrays`` of its own."""
+        if len(reached):
+            parallel_for(
+                kernel, len(reached), reached, self.first, self.xyz_m, self.is_decided,
+                np.ascontiguousarray(depth.depth_m, np.float32),
+                np.ascontiguousarray(depth.sigma_m, np.float32),
+                np.ascontiguousarray(depth.K, np.float64), np.linalg.inv(depth.T_world_camera),
+                *arrays,
+            )  # fmt: skip
 
 
 def _keys(xyz_m: F32 | F64) -> U32:
@@ -153,24 +165,8 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     largest_m = float(sigma.max(initial=0.0))
     for depth in views:
         slack_m = AGREES_SIGMAS * (largest_m + float(np.nanmax(depth.sigma_m, initial=0.0)))
-        reached = tiles.in_view(depth, slack_m)
-        if len(reached):
-            parallel_for(
-                _vote,
-                len(reached),
-                reached,
-                tiles.first,
-                tiles.xyz_m,
-                sigma,
-                np.ascontiguousarray(depth.depth_m, np.float32),
-                np.ascontiguousarray(depth.sigma_m, np.float32),
-                np.ascontiguousarray(depth.views, np.uint8),
-                np.ascontiguousarray(depth.K, np.float64),
-                np.linalg.inv(depth.T_world_camera),
-                seers,
-                asked,
-                tiles.is_decided,
-            )
+        pairs = np.ascontiguousarray(depth.views, np.uint8)
+        tiles.look(_vote, depth, tiles.in_view(depth, slack_m), sigma, pairs, seers, asked)
     out: Bool = np.zeros(len(cloud), np.bool_)
     out[tiles.order] = seers < 0
     return out
@@ -193,22 +189,7 @@ def air_above(
     around = float(up.min(initial=0.0)), float(up.max(initial=0.0))
     for depth in views:
         reached = tiles.in_view(depth, AIR_SLACK_M, around)
-        if len(reached):
-            parallel_for(
-                _look_above,
-                len(reached),
-                reached,
-                tiles.first,
-                tiles.xyz_m,
-                up,
-                np.ascontiguousarray(depth.depth_m, np.float32),
-                np.ascontiguousarray(depth.sigma_m, np.float32),
-                np.ascontiguousarray(depth.K, np.float64),
-                np.linalg.inv(depth.T_world_camera),
-                is_open,
-                behind,
-                tiles.is_decided,
-            )
+        tiles.look(_look_above, depth, reached, up, is_open, behind)
     out: tuple[Bool, U8] = np.zeros_like(is_open), np.zeros_like(behind)
     out[0][tiles.order], out[1][tiles.order] = is_open, behind
     return out
@@ -230,8 +211,8 @@ def pixel_of(K: F64, T: F64, x: float, y: float, z: float) -> tuple[float, float
 
 @njit(cache=True, nogil=True)
 def _look_above(
-    begin: int, end: int, tiles: I64, first: I64, xyz: F32, up_m: F64, depth: F32,
-    depth_sigma: F32, K: F64, T: F64, is_open: Bool, behind: U8, is_decided: Bool,
+    begin: int, end: int, tiles: I64, first: I64, xyz: F32, is_decided: Bool, depth: F32,
+    depth_sigma: F32, K: F64, T: F64, up_m: F64, is_open: Bool, behind: U8,
 ) -> None:  # fmt: skip
     """Take what a keyframe sees of the air ``up_m[j]`` above the places of ``tiles[begin:end]``
     into column j of ``is_open`` and ``behind``."""
@@ -258,8 +239,8 @@ def _look_above(
 
 @njit(cache=True, nogil=True)
 def _vote(
-    begin: int, end: int, tiles: I64, first: I64, xyz: F32, sigma: F32, depth: F32,
-    depth_sigma: F32, views: U8, K: F64, T: F64, seers: I16, asked: U8, is_decided: Bool,
+    begin: int, end: int, tiles: I64, first: I64, xyz: F32, is_decided: Bool, depth: F32,
+    depth_sigma: F32, K: F64, T: F64, sigma: F32, views: U8, seers: I16, asked: U8,
 ) -> None:  # fmt: skip
     """Add one keyframe's votes on the points of ``tiles[begin:end]`` to ``seers``.
 
