@@ -298,12 +298,12 @@ class VirtualStereoCamera:
         if tracked.segment != self._segment:
             self.end_stretch()
             self._segment = tracked.segment
-        if tracked.relative is None:
+        if tracked.T_tracked is None or tracked.relative is None:
             return False
         frame = replace(tracked, image=NO_IMAGE, pyramid=(), mask=None)
         self._tracked.append((frame.time_ns, tracked.relative))
         is_view = self.selection.offer(frame)
-        self._fixes.take(frame.T_odom_camera, frame.prior)
+        self._fixes.take(tracked.T_tracked, frame.prior)
         if is_view:
             self._wait(frame, tracked.image)
         self._latest = None if is_view else (frame, tracked.image)

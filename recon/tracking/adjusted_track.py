@@ -82,8 +82,11 @@ class AdjustedTrack:
         )  # fmt: skip
         self.keyframes = [*self.keyframes[1 - KEPT :], key]
         relative = RelativePose(seq, 0, se3.inverse(key.T_odom_camera) @ still.T_odom_camera, key)
-        found = replace(frame, state=state, segment=0, relative=relative, row_motion=row_motion)
-        return [replace(found, tracks=len(still.landmark))]
+        found = replace(
+            frame, state=state, segment=0, T_tracked=still.T_odom_camera, relative=relative,
+            tracks=len(still.landmark), row_motion=row_motion,
+        )  # fmt: skip
+        return [found]
 
 
 AnyTrack = Odometry | AdjustedTrack

@@ -69,7 +69,8 @@ class Frame:
     is_blurred: bool = False  # takes no part in stereo, only in the track
     state: Tracking = Tracking.SKIPPED
     segment: int = -1
-    relative: RelativePose | None = None  # to the last keyframe when it was tracked
+    T_tracked: F64 | None = None  # (4, 4) T_odom_camera when it was tracked; None: it has no pose
+    relative: RelativePose | None = None  # the same, to the last keyframe
     tracks: int = 0  # corners found
     reason: str = ""  # why it has no pose
     row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known

@@ -177,7 +177,10 @@ class Odometry:
         key = self.keyframes[-1]
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ T_odom_camera
         relative = RelativePose(new.seq, key.segment, T_keyframe_camera, key)
-        return replace(new, state=state, segment=self.segment, relative=relative, tracks=tracks)
+        return replace(
+            new, state=state, segment=self.segment, T_tracked=T_odom_camera, relative=relative,
+            tracks=tracks,
+        )  # fmt: skip
 
     def _unplaced(self, new: Frame, state: Tracking, reason: str, tracks: int = 0) -> Frame:
         """The frame without a pose."""

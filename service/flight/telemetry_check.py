@@ -104,12 +104,12 @@ class TelemetryCheck:
         """Add a frame's pose by vision, at its stamp; evaluate all of them now and then."""
         if self._history is None or frame.state is Tracking.SKIPPED:
             return
+        T = frame.T_tracked
         last, self._last = self._last, None
-        if frame.relative is not None:
-            R_odom_camera = frame.T_odom_camera[:3, :3]
-            self._last = (stamp_ns, frame.segment, R_odom_camera)
+        if T is not None:
+            self._last = (stamp_ns, frame.segment, T[:3, :3].copy())
             if last is not None and last[1] == frame.segment:
-                self._turn(last[0], stamp_ns, last[2].T @ R_odom_camera)
+                self._turn(last[0], stamp_ns, last[2].T @ T[:3, :3])
         if self._next_ns is None:
             self._next_ns = stamp_ns + LOOK_NS
         elif stamp_ns >= self._next_ns:

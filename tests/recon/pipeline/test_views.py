@@ -35,8 +35,9 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Fram
     image = np.zeros((32, 32, 3), np.uint8)
     relative = RelativePose(seq, segment, np.eye(4), key)
     return Frame(
-        image, seq, seq, gray=image[..., 0], is_blurred=blurred, segment=segment, relative=relative
-    )
+        image, seq, seq, gray=image[..., 0], is_blurred=blurred, segment=segment, T_tracked=T,
+        relative=relative,
+    )  # fmt: skip
 
 
 @dataclass

@@ -15,7 +15,7 @@ from mavlink.telemetry.latency import LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
 from recon.frames import R_GIMBAL_CAMERA
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64
 from service.config import CameraConfig
 from service.flight.telemetry_check import AHEAD_NS, TelemetryCheck
@@ -25,8 +25,7 @@ LATE_S = 0.07
 
 
 def seen(state: Tracking, T_odom_camera: F64 | None = None, segment: int = 0) -> Frame:
-    at = None if T_odom_camera is None else RelativePose(0, segment, T_odom_camera)
-    return Frame(NO_IMAGE, 0, 0, state=state, segment=segment, relative=at)
+    return Frame(NO_IMAGE, 0, 0, state=state, segment=segment, T_tracked=T_odom_camera)
 
 
 def body(t: float, strength: float = 1.0) -> Rotation:
