@@ -13,6 +13,7 @@ from numba import njit
 
 from recon.mapping.voxel_map import find_slot, rehash, voxel_key
 from recon.parallel import parallel_for, run_parallel
+from recon.table import Rows
 from recon.types import F32, F64, I32, I64, U8, Bool, DepthMap, PointCloud
 
 CORRELATION = 0.55
@@ -104,29 +105,38 @@ def without(cloud: PointCloud, mask: Bool) -> PointCloud:
     )  # fmt: skip
 
 
+_SUM = np.dtype(
+    [
+        ("xyz", np.float64, 3),  # sum of w xyz over points, w one over the variance
+        ("weight", np.float64),  # of w
+        ("rgb", np.float32, 3),  # of w rgb
+        ("independent", np.float64),  # sum over clouds of the best w
+        ("best_of_last", np.float64),  # w in the last cloud
+        ("best", np.float64),  # w of all
+        ("best_cloud", np.int32),  # which has that
+        ("last", np.int32),  # cloud
+        ("views", np.int32),  # sum over clouds of the most views
+        ("views_of_last", np.int32),  # the most in the last cloud
+    ],
+    align=True,
+)
+"""What is known of a voxel; clouds count from 1."""
+
+
 class _Sums:
-    """The running sums of ``fuse``, in dense arrays found through a hash of voxel keys."""
+    """The running sums of ``fuse``, in a dense array found through a hash of voxel keys."""
 
     def __init__(self) -> None:
         self.keys: I64 = np.full(1 << 16, -1, np.int64)
         self.ids: I32 = np.zeros(1 << 16, np.int32)
+        self.sums: Rows = np.zeros(1 << 15, _SUM)
         self.count = 0
-        rows = 1 << 15
-        # Sums of w x, w y, w z, w over points; of w colour.
-        self.xyzw, self.rgb = np.zeros((rows, 4)), np.zeros((rows, 3), np.float32)
-        # Sum over clouds of the best w; best w of the last cloud; best w of all.
-        self.info = np.zeros((rows, 3))
-        # Last cloud; sum over clouds of the most views; most in the last; cloud of best w.
-        self.tags = np.zeros((rows, 4), np.int32)
 
     def add(self, cloud: PointCloud, number: int, voxel_m: float, low: float, high: float) -> None:
         """Add one cloud's points whose voxel's x index lies in [low, high)."""
-        while len(self.tags) < self.count + len(cloud):
-            for name in ("xyzw", "rgb", "info", "tags"):
-                held = getattr(self, name)
-                grown = np.zeros((2 * len(held), held.shape[1]), held.dtype)
-                grown[: len(held)] = held
-                setattr(self, name, grown)
+        while len(self.sums) < self.count + len(cloud):
+            held, self.sums = self.sums, np.zeros(2 * len(self.sums), _SUM)
+            self.sums[: len(held)] = held
         slots = len(self.keys)
         while slots < 2 * (self.count + len(cloud)):
             slots *= 2
@@ -135,6 +145,7 @@ class _Sums:
         self.count = _accumulate(
             self.keys,
             self.ids,
+            self.sums,
             self.count,
             number + 1,
             np.ascontiguousarray(cloud.xyz_m, np.float32),
@@ -144,10 +155,6 @@ class _Sums:
             1.0 / voxel_m,
             low,
             high,
-            self.xyzw,
-            self.rgb,
-            self.info,
-            self.tags,
         )
 
     def means(self, times_ns: I64 | None) -> _Fused:
@@ -155,47 +162,32 @@ class _Sums:
         at = np.flatnonzero(self.keys != -1)
         at = at[np.argsort(self.keys[at])]
         keys, rows = self.keys[at], self.ids[at]
-        time_ns = None if times_ns is None else times_ns[self.tags[rows, 3] - 1]
-        xyz, rgb, sigma, views = _means(rows, self.xyzw, self.rgb, self.info, self.tags)
-        return keys, PointCloud(xyz, rgb, sigma, views, time_ns=time_ns)
+        time_ns = None if times_ns is None else times_ns[self.sums["best_cloud"][rows] - 1]
+        return keys, PointCloud(*_means(rows, self.sums), time_ns=time_ns)
 
 
 @njit(cache=True, nogil=True)
-def _means(rows: I32, xyzw: F64, colour: F32, info: F64, tags: I32) -> tuple[F32, U8, F32, U8]:
+def _means(rows: I32, sums: Rows) -> tuple[F32, U8, F32, U8]:
     """Places, colours, sigmas and views of the means, in the order of ``rows`` (N,)."""
     count = len(rows)
     xyz, rgb = np.empty((count, 3), np.float32), np.empty((count, 3), np.uint8)
     sigma, views = np.empty(count, np.float32), np.empty(count, np.uint8)
     for n in range(count):
-        r = rows[n]
-        weight = xyzw[r, 3]
+        of = sums[rows[n]]
         for k in range(3):
-            xyz[n, k] = xyzw[r, k] / weight
-            rgb[n, k] = min(max(np.rint(colour[r, k] / weight), 0.0), 255.0)
-        best, independent = 1.0 / info[r, 2], 1.0 / info[r, 0]
+            xyz[n, k] = of.xyz[k] / of.weight
+            rgb[n, k] = min(max(np.rint(of.rgb[k] / of.weight), 0.0), 255.0)
+        best, independent = 1.0 / of.best, 1.0 / of.independent
         sigma[n] = np.sqrt(CORRELATION * best + (1.0 - CORRELATION) * independent)
-        views[n] = min(tags[r, 1], 255)
+        views[n] = min(of.views, 255)
     return xyz, rgb, sigma, views
 
 
 @njit(cache=True, nogil=True)
 def _accumulate(
-    keys: I64,
-    ids: I32,
-    count: int,
-    number: int,
-    xyz: F32,
-    rgb: U8,
-    sigma: F32,
-    views: U8,
-    inverse: float,
-    low: float,
-    high: float,
-    xyzw: F64,
-    colour: F32,
-    info: F64,
-    tags: I32,
-) -> int:
+    keys: I64, ids: I32, sums: Rows, count: int, number: int, xyz: F32, rgb: U8, sigma: F32,
+    views: U8, inverse: float, low: float, high: float,
+) -> int:  # fmt: skip
     """Add the points in [low, high) of the x index to the sums; the new number of voxels.
 
     Points without a sigma are left out.
@@ -215,27 +207,27 @@ def _accumulate(
             keys[t] = key
             ids[t] = count
             count += 1
-        r = ids[t]
+        of = sums[ids[t]]
         w = 1.0 / (float(s) * float(s))
-        xyzw[r, 0] += w * x
-        xyzw[r, 1] += w * y
-        xyzw[r, 2] += w * z
-        xyzw[r, 3] += w
+        of.xyz[0] += w * x
+        of.xyz[1] += w * y
+        of.xyz[2] += w * z
+        of.weight += w
         for c in range(3):
-            colour[r, c] += w * rgb[n, c]
-        if tags[r, 0] != number:
-            tags[r, 0] = number
-            tags[r, 2] = 0
-            info[r, 1] = 0.0
-        if w > info[r, 1]:
-            info[r, 0] += w - info[r, 1]
-            info[r, 1] = w
-        if w > info[r, 2]:
-            info[r, 2] = w
-            tags[r, 3] = number
-        if views[n] > tags[r, 2]:
-            tags[r, 1] += views[n] - tags[r, 2]
-            tags[r, 2] = views[n]
+            of.rgb[c] += w * rgb[n, c]
+        if of.last != number:
+            of.last = number
+            of.views_of_last = 0
+            of.best_of_last = 0.0
+        if w > of.best_of_last:
+            of.independent += w - of.best_of_last
+            of.best_of_last = w
+        if w > of.best:
+            of.best = w
+            of.best_cloud = number
+        if views[n] > of.views_of_last:
+            of.views += views[n] - of.views_of_last
+            of.views_of_last = views[n]
     return count
 
 
