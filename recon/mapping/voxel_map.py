@@ -8,14 +8,13 @@ without the blocks).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 
 from recon import se3
 from recon.camera_model import project, rays
 from recon.parallel import parallel_for
+from recon.table import Rows
 from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
 EMPTY = np.int64(-1)
@@ -73,17 +72,11 @@ def rehash(old: I64, ids: I32, size: int) -> tuple[I64, I32]:
     return keys, out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Voxels:
-    """Voxels outside a map, as they are paged."""
+VOXEL = np.dtype([("sigma_m", np.float32), ("seen", np.int32)])
+"""What is held of a voxel: its sigma, and the turn of the last keyframe that saw it."""
 
-    keys: I64  # (N,)
-    sigma_m: F32  # (N,)
-    seen: I32  # (N,) turn of the last keyframe that saw it
-
-    def where(self, mask: Bool) -> Voxels:
-        """Those under ``mask`` (N,)."""
-        return Voxels(self.keys[mask], self.sigma_m[mask], self.seen[mask])
+PAGED = np.dtype([("key", np.int64), *VOXEL.descr])
+"""A voxel outside a map, as it is paged."""
 
 
 def tile_of(keys: I64) -> I64:
@@ -153,13 +146,13 @@ class VoxelMap:
 
     @property
     def nbytes(self) -> int:
-        return sum(a.nbytes for a in (self._keys, self._ids, self._sigma, self._seen))
+        return self._keys.nbytes + self._ids.nbytes + self._voxels.nbytes
 
     def fresh(self, depth: DepthMap) -> Bool:
         """(h, w) pixels whose surface is new, or clearly better than what is held."""
         out = np.zeros(depth.depth_m.shape, np.bool_)
         parallel_for(
-            _fresh, len(out), self._keys, self._ids, self._sigma, *_arrays(depth),
+            _fresh, len(out), self._keys, self._ids, self._voxels, *_arrays(depth),
             1.0 / self.voxel_m, BETTER_RATIO, REACH_SIGMA, LARGEST_REACH, out,
         )  # fmt: skip
         return out
@@ -174,25 +167,17 @@ class VoxelMap:
         before = self._count
         self._count = int(
             _insert(
-                self._keys,
-                self._ids,
-                self._sigma,
-                self._seen,
-                self._count,
-                self._turn,
-                *_arrays(depth),
-                mask_,
-                1.0 / self.voxel_m,
+                self._keys, self._ids, self._voxels, self._count, self._turn, *_arrays(depth),
+                mask_, 1.0 / self.voxel_m,
             )
-        )
+        )  # fmt: skip
         return self._count - before
 
     def _clear(self) -> None:
         slots = 1 << 16
         self._keys: I64 = np.full(slots, EMPTY, np.int64)
         self._ids: I32 = np.zeros(slots, np.int32)
-        self._sigma: F32 = np.zeros(slots // 2, np.float32)
-        self._seen: I32 = np.zeros(slots // 2, np.int32)
+        self._voxels: Rows = np.zeros(slots // 2, VOXEL)
         self._count = 0
 
     def _make_room(self, more: int) -> None:
@@ -204,49 +189,44 @@ class VoxelMap:
         if slots == len(self._keys):
             return
         self._keys, self._ids = rehash(self._keys, self._ids, slots)
-        self._sigma = np.resize(self._sigma, slots // 2)
-        self._seen = np.resize(self._seen, slots // 2)
+        self._voxels = np.resize(self._voxels, slots // 2)
 
-    def take(self, tiles: I64) -> Voxels:
-        """Remove all voxels of some tiles (:func:`tile_of`) and return them."""
+    def take(self, tiles: I64) -> Rows:
+        """Remove all voxels of some tiles (:func:`tile_of`) and return them, rows of PAGED."""
         held = self._held()
-        gone = np.isin(tile_of(held.keys), tiles)
-        self._refill(held.where(~gone))
-        return held.where(gone)
+        gone = np.isin(tile_of(held["key"]), tiles)
+        self._refill(held[~gone])
+        return held[gone]
 
-    def put(self, voxels: Voxels) -> None:
+    def put(self, voxels: Rows) -> None:
         """Add voxels taken before; where one is held already the smaller sigma stays."""
-        self._make_room(len(voxels.keys))
-        self._count = int(
-            _put(
-                self._keys, self._ids, self._sigma, self._seen, self._count, voxels.keys,
-                voxels.sigma_m, voxels.seen,
-            )
-        )  # fmt: skip
+        self._make_room(len(voxels))
+        self._count = int(_put(self._keys, self._ids, self._voxels, self._count, voxels))
 
     def oldest_tiles(self) -> tuple[I64, I64]:
         """(T,) tiles that hold voxels, those seen longest ago first, and (T,) how many."""
         held = self._held()
         tiles, index, counts = np.unique(
-            tile_of(held.keys), return_inverse=True, return_counts=True
+            tile_of(held["key"]), return_inverse=True, return_counts=True
         )
         newest = np.zeros(len(tiles), np.int32)
-        np.maximum.at(newest, index, held.seen)
+        np.maximum.at(newest, index, held["seen"])
         order = np.argsort(newest, kind="stable")
         return np.asarray(tiles[order]), np.asarray(counts[order], np.int64)
 
     def _forget_half(self) -> None:
         held = self._held()
-        self._refill(held.where(held.seen > int(np.median(held.seen))))
+        self._refill(held[held["seen"] > int(np.median(held["seen"]))])
 
-    def _held(self) -> Voxels:
+    def _held(self) -> Rows:
         at = np.flatnonzero(self._keys != EMPTY)
-        ids = self._ids[at]
-        return Voxels(self._keys[at], self._sigma[ids], self._seen[ids])
+        out = np.empty(len(at), PAGED)
+        out["key"], out[["sigma_m", "seen"]] = self._keys[at], self._voxels[self._ids[at]]
+        return out
 
-    def _refill(self, voxels: Voxels) -> None:
+    def _refill(self, voxels: Rows) -> None:
         self._clear()
-        self._make_room(2 * len(voxels.keys))
+        self._make_room(2 * len(voxels))
         self.put(voxels)
 
 
@@ -261,27 +241,25 @@ def _arrays(depth: DepthMap) -> tuple[F32, F32, F64, F64]:
 
 
 @njit(cache=True, nogil=True)
-def _put(
-    keys: I64, ids: I32, held: F32, seen: I32, count: int, new: I64, sigma: F32, turn: I32
-) -> int:
+def _put(keys: I64, ids: I32, held: Rows, count: int, new: Rows) -> int:
     """See VoxelMap.put; the new number of voxels."""
     for n in range(new.shape[0]):
-        t = find_slot(keys, new[n])
+        t = find_slot(keys, new[n].key)
         if keys[t] == -1:
-            keys[t] = new[n]
+            keys[t] = new[n].key
             ids[t] = count
-            held[count] = sigma[n]
-            seen[count] = turn[n]
+            held[count].sigma_m, held[count].seen = new[n].sigma_m, new[n].seen
             count += 1
             continue
-        held[ids[t]] = min(held[ids[t]], sigma[n])
-        seen[ids[t]] = max(seen[ids[t]], turn[n])
+        known = held[ids[t]]
+        known.sigma_m = min(known.sigma_m, new[n].sigma_m)
+        known.seen = max(known.seen, new[n].seen)
     return count
 
 
 @njit(cache=True, nogil=True, fastmath=False)
 def _fresh(
-    begin: int, end: int, keys: I64, ids: I32, held: F32, depth: F32, sigma: F32, K: F64, T: F64,
+    begin: int, end: int, keys: I64, ids: I32, held: Rows, depth: F32, sigma: F32, K: F64, T: F64,
     inverse: float, better: float, reach_sigma: float, largest_reach: int, out: Bool,
 ) -> None:  # fmt: skip
     """See VoxelMap.fresh; the ray is sampled every voxel, nearest samples first."""
@@ -310,7 +288,7 @@ def _fresh(
                     known = True
                     break
                 t = find_slot(keys, key)
-                if keys[t] == key and held[ids[t]] <= s * better:
+                if keys[t] == key and held[ids[t]].sigma_m <= s * better:
                     known = True
                     break
             out[v, u] = not known
@@ -318,8 +296,8 @@ def _fresh(
 
 @njit(cache=True, nogil=True)
 def _insert(
-    keys: I64, ids: I32, held: F32, seen: I32, count: int, turn: int, depth: F32, sigma: F32,
-    K: F64, T: F64, mask: Bool, inverse: float,
+    keys: I64, ids: I32, held: Rows, count: int, turn: int, depth: F32, sigma: F32, K: F64, T: F64,
+    mask: Bool, inverse: float,
 ) -> int:  # fmt: skip
     """See VoxelMap.insert; the new number of voxels."""
     h, w = depth.shape
@@ -342,11 +320,11 @@ def _insert(
             if keys[t] == -1:
                 keys[t] = key
                 ids[t] = count
-                held[count] = s
+                held[count].sigma_m = s
                 count += 1
-            elif s < held[ids[t]]:
-                held[ids[t]] = s
-            seen[ids[t]] = turn
+            known = held[ids[t]]
+            known.sigma_m = min(known.sigma_m, s)
+            known.seen = turn
     return count
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from recon.mapping.voxel_map import (
     LARGEST_REACH,
     LARGEST_VOXELS,
+    PAGED,
     VoxelMap,
-    Voxels,
     tile_of,
     tiles_under,
 )
@@ -79,10 +79,9 @@ class PagedMap(VoxelMap):
             self._away.discard(tile)
             path = self._path(tile)
             try:
-                with np.load(path) as page:
-                    self.put(Voxels(page["keys"], page["sigma_m"], page["seen"]))
+                self.put(np.load(path).astype(PAGED, casting="no"))
                 path.unlink()
-            except (OSError, KeyError, ValueError, EOFError) as error:
+            except (OSError, TypeError, ValueError, EOFError) as error:
                 log.warning(
                     "page %s of the map is lost (%s): its ground counts as new", path, error
                 )
@@ -95,12 +94,12 @@ class PagedMap(VoxelMap):
         surplus = len(self) - self.max_voxels // 2
         tiles = tiles[: int(np.searchsorted(np.cumsum(counts), surplus)) + 1]
         taken = self.take(tiles)
-        home = tile_of(taken.keys)
+        home = tile_of(taken["key"])
         for tile in tiles.tolist():
-            page = taken.where(home == tile)
+            page = taken[home == tile]
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
-                np.savez(self._path(tile), keys=page.keys, sigma_m=page.sigma_m, seen=page.seen)
+                np.save(self._path(tile), page)
                 self._away.add(tile)
             except OSError as error:
                 log.warning("the map cannot be paged to %s: %s", self.folder, error)
@@ -108,4 +107,4 @@ class PagedMap(VoxelMap):
                 self._broken = True
 
     def _path(self, tile: int) -> Path:
-        return self.folder / f"{tile}.npz"
+        return self.folder / f"{tile}.npy"

@@ -66,7 +66,7 @@ def test_a_damaged_page_makes_its_ground_new_and_nothing_else(tmp_path: Path) ->
     for depth in survey()[:40]:
         paged.insert(depth)
     assert paged.tiles_on_disk > 0
-    for page in tmp_path.glob("*.npz"):
+    for page in tmp_path.glob("*.npy"):
         page.write_bytes(b"\x00garbage")
     assert paged.fresh(view(0.0)).mean() > 0.95
     assert paged.fresh(view(12.0 * 39)).mean() < 0.05
