@@ -65,6 +65,11 @@ class LocalFrame:
         geodetic = out[:, [1, 0, 2]]
         return geodetic if self.heights is None else self.heights(geodetic)
 
+    def place(self, enu_m: F64) -> tuple[float, float, float]:
+        """Latitude, longitude and AMSL metres of one place (3,)."""
+        lat_deg, lon_deg, alt_m = self.to_geodetic(enu_m[None])[0].tolist()
+        return lat_deg, lon_deg, alt_m
+
     def to_utm(self, enu_m: Array) -> F64:
         """(N, 3) easting, northing and AMSL metres in the zone ``epsg`` of (N, 3) ENU metres."""
         g = self.to_geodetic(enu_m)

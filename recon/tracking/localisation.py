@@ -44,8 +44,6 @@ LOOSE_PX = 6.0
 LOW_RATE_GAP_S = 0.7
 """Frames further apart are stills: no motion model holds."""
 
-MATCHING = matching.MatchingConfig()
-
 RECALLED = 4
 """Newest keyframes that a frame is compared with by features."""
 
@@ -335,7 +333,7 @@ class Localiser:
         uv, warp, visible = prediction.on_landmarks(
             key, self.camera.K, self.camera.size_px, T_camera_odom
         )
-        in_view, config = float(visible.mean()), MATCHING
+        in_view, config = float(visible.mean()), matching.DEFAULT
         if taken is not None:
             visible &= ~np.isin(key.landmark, taken)
         if most is not None:
@@ -457,6 +455,6 @@ class Localiser:
         """Where (N, 2) a keyframe's corners are in a frame, about ``uv``, and which are found."""
         found = matching.match(
             key.pyramid, key.uv.astype(np.float32), new.pyramid, uv.astype(np.float32),
-            radius_px, warp.astype(np.float32), MATCHING,
+            radius_px, warp.astype(np.float32),
         )  # fmt: skip
         return found.uv_px.astype(np.float64), found.ok

@@ -163,6 +163,9 @@ class MatchingConfig:
     max_return_px: float = 0.5  # forward and backward match may differ by this; inf: not matched
 
 
+DEFAULT = MatchingConfig()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
     """Where each point of image a was found in image b."""
@@ -190,7 +193,7 @@ def _check_gray(gray: U8) -> None:
         raise ValueError(f"image must be (H, W) uint8 of 16 px or more, got {gray.shape}")
 
 
-def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> F32:
+def harris_grid(gray: U8, config: MatchingConfig = DEFAULT, mask: U8 | None = None) -> F32:
     """(N, 3) u, v and R of the strongest Harris corner in each cell of ``gray`` (H, W), Eq. 4-5.
 
     ``mask`` (H, W) is zero where the image holds nothing; patches stay clear of it.
@@ -301,7 +304,7 @@ def match(
     uv_b_predicted: npt.ArrayLike,
     radius_px: float,
     warp: npt.ArrayLike | None = None,
-    config: MatchingConfig | None = None,
+    config: MatchingConfig = DEFAULT,
 ) -> Matches:
     """Where the points ``uv_a`` (N, 2) of image a lie in image b.
 
@@ -313,7 +316,6 @@ def match(
     others. Points that are not finite are not ok. With a ``radius_px`` of 0 predictions that are
     good to a pixel are only refined.
     """
-    config = config or MatchingConfig()
     a, predicted = checked_points(uv_a), checked_points(uv_b_predicted)
     forward_warp, inverse_warp = checked_warps(warp, len(a))
     forward = _Search(pyramid_a, pyramid_b, a, inverse_warp, config)

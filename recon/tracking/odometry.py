@@ -30,7 +30,6 @@ from recon.tracking.keyframe_window import (
 from recon.tracking.localisation import (
     LOOSE_PX,
     LOW_RATE_GAP_S,
-    MATCHING,
     MIN_BASE_TO_HEIGHT,
     MIN_TRACKS,
     SEARCH_SHARE,
@@ -234,7 +233,7 @@ class Odometry:
 
     def _corners(self, new: Frame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
-        found = matching.harris_grid(new.small, MATCHING, new.mask)
+        found = matching.harris_grid(new.small, mask=new.mask)
         return found[:, :2].astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------
@@ -367,7 +366,7 @@ class Odometry:
             kept = np.vstack([kept, uv[ok]])
             landmark = np.concatenate([landmark, key.landmark[ok]])
         fresh = prediction.fresh_corners(
-            self._corners(new), kept, self.camera.size_px, MATCHING.grid
+            self._corners(new), kept, self.camera.size_px, matching.DEFAULT.grid
         )
         uv = np.vstack([kept, fresh])
         landmark = np.concatenate([landmark, np.full(len(fresh), -1, np.int64)])

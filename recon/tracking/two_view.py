@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
+from recon.camera_model import project
 from recon.tracking import bundle, robust_geometry
 from recon.types import F64, Bool
 
@@ -104,11 +105,9 @@ def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64) -> TwoView | None:
 
 def reprojection_error(T_camera_world: F64, points_m: F64, K: F64, uv_px: F64) -> F64:
     """(N,) distance in pixels; inf for points behind the camera or NaN."""
-    P = se3.transform(T_camera_world, points_m)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        uv = P[:, :2] / P[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
-        error = np.linalg.norm(uv - uv_px, axis=1)
-    return np.asarray(np.where((P[:, 2] > 0) & np.isfinite(error), error, np.inf))
+    uv = project(K, se3.transform(T_camera_world, points_m))
+    error = np.linalg.norm(uv - uv_px, axis=1)
+    return np.asarray(np.where(np.isfinite(error), error, np.inf))
 
 
 def ground_normal(points: F64) -> F64:

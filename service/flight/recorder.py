@@ -277,7 +277,7 @@ class Recorder:
         lat = lon = alt = None
         local = self._rig.local_frame
         if local is not None:
-            lat, lon, alt = (float(x) for x in local.to_geodetic(T[None, :3, 3])[0])
+            lat, lon, alt = local.place(T[:3, 3])
         return PoseRecord(
             time_unix_ns=time_ns,
             T_world_camera=T,

@@ -116,7 +116,7 @@ def keyframe_report(
     head = None if R_world_camera is None else _head(R_world_camera)
     lat = lon = alt = None
     if position_m is not None and frame is not None:
-        lat, lon, alt = _place(frame, position_m)
+        lat, lon, alt = frame.place(position_m)
     return KeyframeReport(time_unix_ns // 1000, lat, lon, alt, agl_m, head, file=file)
 
 
@@ -133,11 +133,11 @@ def camera_view(config: CameraConfig, camera: Camera, state: VehicleState | None
     frame, position = rig.local_frame, prior.position_m
     if frame is None or position is None or state is None or state.alt_amsl_m is None:
         return view
-    view = replace(view, camera=_place(frame, position))
+    view = replace(view, camera=frame.place(position))
     if R is None or prior.is_agl_assumed or prior.agl_m is None or R[2, 2] > -MIN_DOWN:
         return view
     middle = position - R[:, 2] * (prior.agl_m / R[2, 2])
-    return replace(view, ground=_place(frame, middle))
+    return replace(view, ground=frame.place(middle))
 
 
 def _head(R_world_camera: F64) -> tuple[float, float, float, float]:
@@ -145,9 +145,3 @@ def _head(R_world_camera: F64) -> tuple[float, float, float, float]:
     R_ned_head = np.asarray(R_ENU_NED.T @ R_world_camera @ R_GIMBAL_CAMERA.T)
     w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_head))
     return w, x, y, z
-
-
-def _place(frame: LocalFrame, position_m: F64) -> tuple[float, float, float]:
-    """Latitude, longitude and altitude of (3,) ENU metres."""
-    lat, lon, alt = (float(v) for v in frame.to_geodetic(position_m[None])[0])
-    return lat, lon, alt

@@ -272,7 +272,7 @@ def _record(
     roll, pitch, yaw = attitude_of(T)
     lat = lon = alt = None
     if place is not None:
-        lat, lon, alt = (float(v) for v in place.to_geodetic(T[None, :3, 3])[0])
+        lat, lon, alt = place.place(T[:3, 3])
     sigma = se3.sigma_at(T[:3, 3], spread)
     return replace(
         frame, T_world_camera=T, covariance=spread, lat_deg=lat, lon_deg=lon, alt_amsl_m=alt,

@@ -222,7 +222,7 @@ def _copy_poses(
 
 def placed_pose(pose: PoseRecord, T: F64, origin: LocalFrame) -> PoseRecord:
     """The record at another pose, with its geographic position."""
-    lat, lon, alt = (float(v) for v in origin.to_geodetic(T[None, :3, 3])[0])
+    lat, lon, alt = origin.place(T[:3, 3])
     good = all(math.isfinite(v) for v in (lat, lon, alt))
     return replace(
         pose, T_world_camera=T, lat_deg=lat if good else None, lon_deg=lon if good else None,
