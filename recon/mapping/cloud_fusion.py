@@ -163,7 +163,8 @@ class _Sums:
         at = at[np.argsort(self.keys[at])]
         keys, rows = self.keys[at], self.ids[at]
         time_ns = None if times_ns is None else times_ns[self.sums["best_cloud"][rows] - 1]
-        return keys, PointCloud(*_means(rows, self.sums), time_ns=time_ns)
+        xyz, rgb, sigma, views = _means(rows, self.sums)
+        return keys, PointCloud(xyz, rgb, sigma, views, time_ns=time_ns)
 
 
 @njit(cache=True, nogil=True)
