@@ -200,8 +200,21 @@ def _apart(found: dict[str, Any]) -> str:
 
 
 def surveyed(refined: dict[str, Any]) -> list[str]:
-    """The residuals of control and check points; empty without any."""
-    return ["<h3>Surveyed points</h3>", _survey(refined)] if refined.get("points") else []
+    """Each control or check point's offset in the map, before and after; empty without any."""
+    if not refined.get("points"):
+        return []
+    rows = []
+    for p in refined["points"]:
+        offsets = [_offset(p["before_m"]), _offset(p["after_m"])]
+        rows.append([p["name"], p["role"], str(p["marks"]), *offsets, p["refused"] or ""])
+    for role in ("control", "check"):
+        s = refined.get(role)
+        if s:
+            apart_m = [(s[f"rms_h_{w}_m"], s[f"rms_v_{w}_m"]) for w in ("before", "after")]
+            sums = [", ".join(f"{m:.3f} m" for m in two if m is not None) for two in apart_m]
+            rows.append([f"rms of {s['count']}", role, "", *sums, "horizontal, vertical"])
+    header = ("point", "role", "marks", "map minus survey before: east, north, up, m", "after", "")
+    return ["<h3>Surveyed points</h3>", table(rows, header)]
 
 
 def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
@@ -303,22 +316,6 @@ def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:
 def _when(unix_s: float) -> str:
     when = dt.datetime.fromtimestamp(unix_s, dt.timezone.utc)
     return when.strftime("%Y-%m-%d %H:%M:%S UTC")
-
-
-def _survey(refined: dict[str, Any]) -> str:
-    """Each point's offset in the map, before and after, and rms values."""
-    rows = []
-    for p in refined["points"]:
-        offsets = [_offset(p["before_m"]), _offset(p["after_m"])]
-        rows.append([p["name"], p["role"], str(p["marks"]), *offsets, p["refused"] or ""])
-    for role in ("control", "check"):
-        s = refined.get(role)
-        if s:
-            apart_m = [(s[f"rms_h_{w}_m"], s[f"rms_v_{w}_m"]) for w in ("before", "after")]
-            sums = [", ".join(f"{m:.3f} m" for m in two if m is not None) for two in apart_m]
-            rows.append([f"rms of {s['count']}", role, "", *sums, "horizontal, vertical"])
-    header = ("point", "role", "marks", "map minus survey before: east, north, up, m", "after", "")
-    return table(rows, header)
 
 
 def _offset(values: Sequence[float | None] | None) -> str:

@@ -60,7 +60,7 @@ from service.stream.validity import summary_from_json
 _NOT_TOO_LARGE = f"LENGTH(data) <= {codec.MAX_LAYER_BYTES}"
 _IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {codec.MAX_LAYERS - 1}"
 HELD_BYTES = 500_000_000
-"""Decoded keyframes that are held, by default."""
+"""Decoded keyframes that are held."""
 
 DECODED_BYTES = 13
 """A pixel of a keyframe: depth, sigma, views, colour, mask."""
@@ -271,10 +271,10 @@ class ScanStore:
                 return decoded
         return self.radio.keyframe(seq)
 
-    def hold_decoded(self, max_bytes: int = HELD_BYTES) -> None:
+    def hold_decoded(self) -> None:
         """Hold decoded layers in memory, for who reads all keyframes several times; they must not
         be written into."""
-        self._held_room = max_bytes
+        self._held_room = HELD_BYTES
 
     def _decoded(self, seq: int, number: int) -> Keyframe | None:
         """A layer's keyframe, as it was sent."""
