@@ -154,17 +154,12 @@ class Library:
         return path
 
     def label(
-        self,
-        drone: str,
-        scan: str,
-        title: str | None,
-        tags: list[str] | None,
-        edition: int | None = None,
+        self, drone: str, scan: str, title: str | None, tags: list[str] | None, edition: int | None
     ) -> Labels:
         """Rename or tag a scan; what is None stays. Raises InputError for unfit values.
 
         ``edition`` is that of the labels the change was made on: ConflictError when they have
-        changed since, and nothing is written. Without it the last of two changes holds.
+        changed since, and nothing is written. With None the last of two changes holds.
         """
         with self.changing(drone, scan) as folder:
             old = read_labels(folder)

@@ -37,9 +37,8 @@ import numpy as np
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from recon.types import F64
 from service.errors import SkyreliefError
-from service.ground.live_site import SiteNews
+from service.ground.live_site import SiteNews, columns
 from service.stream import codec, planes
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord
@@ -104,11 +103,6 @@ def _codes(section: bytes) -> bytes:
     size = planes.image_size(section)
     codes = None if size is None else planes.open_jpeg_ls(section, *size)
     return b"" if codes is None else zlib.compress(codes.astype(np.uint8).tobytes(), 1)
-
-
-def columns(T: F64) -> list[float]:
-    """The 16 numbers of a (4, 4) matrix, column by column."""
-    return [round(float(v), 9) for v in np.asarray(T).T.ravel()]
 
 
 @dataclass(slots=True, eq=False)

@@ -205,8 +205,13 @@ def _entry(own: Shown, one: Shown) -> dict[str, object]:
     return {
         "drone": one.drone, "scan": one.scan, "own": one is own,
         "earlier": one.started_unix_s < own.started_unix_s - SAME_VISIT_S, "ties": one.ties,
-        "sigma_m": one.sigma_m, "T": [round(float(v), 9) for v in T.T.ravel()],
+        "sigma_m": one.sigma_m, "T": columns(T),
     }  # fmt: skip
+
+
+def columns(T: F64) -> list[float]:
+    """The 16 numbers of a (4, 4) matrix, column by column."""
+    return [round(float(v), 9) for v in T.T.ravel()]
 
 
 def _matrix(numbers: list[float]) -> F64:

@@ -115,7 +115,7 @@ def test_an_import_holds_no_lock_of_the_library(
             library.bring_in(card)
         name = library.bin()[0]
         library.restore(name)
-        library.label("drone-1", "test-1", "meanwhile", None)
+        library.label("drone-1", "test-1", "meanwhile", None, None)
         library.delete("drone-1", "test-1")
     finally:
         go_on.set()
