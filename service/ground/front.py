@@ -55,7 +55,7 @@ class Front:
         assert found is not None
         self.endpoint = endpoint
         self._host, self._port = found[2].strip("[]"), int(found[3])
-        self._listener: BoundedListener | None = self._listen()
+        self._listener = self._listen()
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self._inner = probe.getsockname()[:2]
@@ -64,26 +64,25 @@ class Front:
 
     def _listen(self) -> BoundedListener:
         try:
-            limits = fitting(LIMITS, 8)  # a connection takes two descriptors
-            listener = BoundedListener(self._host, self._port, limits)
+            # A connection takes two descriptors.
+            return BoundedListener(self._host, self._port, fitting(LIMITS, 8))
         except OSError as error:
             raise OutsideError(
                 f"datalink does not open at {self.endpoint}: {error.strerror}; another program may "
                 "have this port, such as a second ground station"
             ) from error
-        return listener
 
     def close(self) -> None:
         """Release the address where :meth:`run` was not called."""
-        if self._listener is not None:
-            self._listener.close()
+        self._listener.close()
 
     def run(self, worker: Worker) -> None:
-        listener, self._listener = self._listener or self._listen(), None
+        if worker.restarts:
+            self._listener = self._listen()
         try:
-            asyncio.run(self._serve(worker, listener))
+            asyncio.run(self._serve(worker, self._listener))
         finally:
-            listener.close()
+            self._listener.close()
 
     async def _serve(self, worker: Worker, listener: BoundedListener) -> None:
         async def accept(*outer: Any) -> None:

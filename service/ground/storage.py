@@ -67,18 +67,16 @@ class DiskShare:
                 f"{self._folder} has reached its share, {100 * self._share:g} % of the disk; "
                 "delete scans or give --drone-share"
             )
-        if self._free_bytes - size_bytes < self._reserve():
+        reserve_bytes = self._reserve_bytes
+        if reserve_bytes is None:
+            reserve_bytes = min(int(RESERVE_SHARE * self._total_bytes), MAX_RESERVE_BYTES)
+        if self._free_bytes - size_bytes < reserve_bytes:
             raise OutsideError(
                 f"the disk of {self._folder} is full but for its reserve of "
-                f"{self._reserve() / 1e6:.0f} MB; free some space or give --reserve-mb"
+                f"{reserve_bytes / 1e6:.0f} MB; free some space or give --reserve-mb"
             )
         self._used_bytes += size_bytes
         self._free_bytes -= size_bytes
-
-    def _reserve(self) -> float:
-        if self._reserve_bytes is not None:
-            return self._reserve_bytes
-        return min(RESERVE_SHARE * self._total_bytes, MAX_RESERVE_BYTES)
 
     def _look(self, now: float) -> None:
         """Measure the disk, and now and then the folder: others write there too."""
