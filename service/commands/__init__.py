@@ -5,7 +5,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import MISSING, fields
 from inspect import Parameter, Signature
 from pathlib import Path
@@ -109,20 +109,38 @@ def stop_by_signals() -> Event:
 @contextmanager
 def showing(name: str) -> Iterator[Progress]:
     """Progress of long work on stderr: a bar in a terminal, else a line for each step and for
-    each twentieth of the work."""
-    if not sys.stderr.isatty():
-        said: list[tuple[str, int]] = [("", 0)]
+    each twentieth of the work. Ctrl-C also cancels the work of other threads."""
+    with ExitStack() as open_now:
+        show = open_now.enter_context(_bar(name)) if sys.stderr.isatty() else _lines(name)
+        progress = Progress(show)
 
-        def say(now: Progress) -> None:
-            step = now.text, int(now.share * 20.0)
-            if step != said[-1]:
-                said[:] = [step]
-                share = f", {5 * step[1]} %" if step[1] else ""
-                print(f"{name}: {now.text}{share}", file=sys.stderr)
+        def cancel(*_: object) -> None:
+            progress.cancel()
+            raise KeyboardInterrupt
 
-        with _cancelled_by_ctrl_c(Progress(say)) as progress:
-            yield progress
-        return
+        before = signal.getsignal(signal.SIGINT)
+        if before is signal.default_int_handler:  # a shell's background jobs ignore it
+            signal.signal(signal.SIGINT, cancel)
+            open_now.callback(signal.signal, signal.SIGINT, before)
+        yield progress
+
+
+def _lines(name: str) -> Callable[[Progress], None]:
+    said = "", 0
+
+    def say(now: Progress) -> None:
+        nonlocal said
+        step = now.text, int(now.share * 20.0)
+        if step != said:
+            said = step
+            share = f", {5 * step[1]} %" if step[1] else ""
+            print(f"{name}: {now.text}{share}", file=sys.stderr)
+
+    return say
+
+
+@contextmanager
+def _bar(name: str) -> Iterator[Callable[[Progress], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
@@ -131,28 +149,4 @@ def showing(name: str) -> Iterator[Progress]:
     console = Console(stderr=True)
     with Bars(*columns, TimeRemainingColumn(), console=console, transient=True) as bars:
         bar = bars.add_task(name, total=1.0)
-
-        def show(now: Progress) -> None:
-            bars.update(bar, completed=now.share, description=f"{name}: {now.text}")
-
-        with _cancelled_by_ctrl_c(Progress(show)) as progress:
-            yield progress
-
-
-@contextmanager
-def _cancelled_by_ctrl_c(progress: Progress) -> Iterator[Progress]:
-    """Ctrl-C also cancels the work of other threads; a shell's background jobs ignore it."""
-
-    def cancel(*_: object) -> None:
-        progress.cancel()
-        raise KeyboardInterrupt
-
-    before = signal.getsignal(signal.SIGINT)
-    if before is not signal.default_int_handler:
-        yield progress
-        return
-    signal.signal(signal.SIGINT, cancel)
-    try:
-        yield progress
-    finally:
-        signal.signal(signal.SIGINT, before)
+        yield lambda now: bars.update(bar, completed=now.share, description=f"{name}: {now.text}")

@@ -243,7 +243,7 @@ class Flown:
 def test_a_replay_shows_its_share_and_its_figures() -> None:
     seen: list[tuple[str, float]] = []
     progress = Progress(lambda now: seen.append((now.text, round(now.share, 3))))
-    scan, images, pipe = cast("Scan", Flown()), Mock(images=4), Mock(spec=[])
+    scan, images, pipe = cast("Scan", Flown()), Mock(images=4), Mock(images=0)
     with redirect_stderr(Terminal()), progress.part("tracking", of_rest=0.9):
         show = replay.show_flown(images, progress)
         for _ in range(4):
