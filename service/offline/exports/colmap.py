@@ -19,7 +19,7 @@ from recon.calibration.tracks import crossings, without_distortion
 from recon.camera_model import Undistorter
 from recon.types import F64, U8, Camera, Keyframe
 from service.errors import InputError
-from service.offline.exports.images import frames_at, source_of
+from service.offline.exports.images import frames_at, recording_for
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.refine.own_camera import sightings
 from service.scans.main_piece import main_keyframes
@@ -39,7 +39,7 @@ def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:
     Raises InputError where neither shows whole images.
     """
     header, keyframes = scan.store.header, list(main_keyframes(scan.store))
-    video = source_of(scan, options)
+    video = recording_for(scan, options).path
     frames: Iterable[tuple[int, U8]]
     if video is not None:
         camera = camera_of(header)

@@ -89,46 +89,35 @@ def recording_of(
     return Recording(found, f"textures from {found}, which the scan was made from")
 
 
-def scan_images(
-    keyframes: Sequence[Keyframe],
-    folder: Path,
-    header: ScanHeader,
-    options: ExportOptions,
-    progress: Progress,
-) -> list[TextureView]:
-    """A view per keyframe: from the recording that the options or the scan name, else from the
-    store.
-
-    Raises InputError or OutsideError when the named recording cannot be used.
-    """
-    if options.video is not None:
-        return video_images(keyframes, header, options.video, options.video_epoch_ns, progress)
-    recording = Recording(None, "") if options.stored else recording_of(folder, header)
-    progress(recording.words)
-    if recording.path is None:
-        return stored_images(keyframes)
-    try:
-        return video_images(keyframes, header, recording.path, options.video_epoch_ns, progress)
-    except SkyreliefError as error:
-        progress(f"the scan's own images after all: {error}")
-        return stored_images(keyframes)
+def recording_for(scan: ScanView, options: ExportOptions) -> Recording:
+    """What images are taken from: the named recording, or else the scan's own where it is there."""
+    if options.video is not None or options.stored:
+        return Recording(options.video, "")
+    return recording_of(scan.folder, scan.store.header)
 
 
 def shared_images(scan: ScanView, options: ExportOptions) -> list[TextureView]:
-    """:func:`scan_images` of the main piece's keyframes; read once for all products."""
+    """A view per keyframe of the main piece, by :func:`recording_for`; read once for all products.
+
+    Raises InputError or OutsideError when the named recording cannot be used.
+    """
 
     def read() -> list[TextureView]:
-        keyframes = list(main_keyframes(scan.store))
-        return scan_images(keyframes, scan.folder, scan.store.header, options, scan.progress)
+        keyframes, header = list(main_keyframes(scan.store)), scan.store.header
+        found, epoch_ns = recording_for(scan, options), options.video_epoch_ns
+        if found.words:
+            scan.progress(found.words)
+        if found.path is None:
+            return stored_images(keyframes)
+        try:
+            return video_images(keyframes, header, found.path, epoch_ns, scan.progress)
+        except SkyreliefError as error:
+            if options.video is not None:
+                raise
+            scan.progress(f"the scan's own images after all: {error}")
+            return stored_images(keyframes)
 
     return scan.shared(("images", images_key(options)), read)
-
-
-def source_of(scan: ScanView, options: ExportOptions) -> Path | None:
-    """The recording that images are taken from; None where it is the scan's own store."""
-    if options.video is not None or options.stored:
-        return options.video
-    return recording_of(scan.folder, scan.store.header).path
 
 
 def images_key(options: ExportOptions) -> tuple[Path | None, bool, int | None]:

@@ -20,7 +20,7 @@ from recon.surface.texturing import texture
 from recon.surface.volume import volume_mesh
 from recon.types import F64, U8
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import images_key, opened, shared_images, source_of
+from service.offline.exports.images import images_key, opened, recording_for, shared_images
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
 from service.packages import needing
 from service.progress import Progress
@@ -102,7 +102,7 @@ def _mesh_parts(
     )
     nothing = "cannot be meshed, there is too little surface"
     parts = list(in_parts(scan, make, options, MARGIN_M, on_map=False, nothing=nothing))
-    video = source_of(scan, options)
+    video = recording_for(scan, options).path
     figures = {
         "tiles": len(parts),
         "faces": sum(p.figures["faces"] for p in parts),

@@ -22,7 +22,7 @@ from recon.surface.texture_views import TextureView
 from recon.types import Array
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import shared_images, source_of
+from service.offline.exports.images import recording_for, shared_images
 from service.offline.exports.surface import bare_ground, cell_places, complete_model, surface_model
 from service.offline.exports.view import (
     NO_POINTS,
@@ -132,15 +132,15 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
 
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    _write(scan, out, options, dsm, GROUND_MARGIN_M)
+    _write(scan, out, options, dsm)
 
 
 def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    _write(scan, out, options, dtm, GROUND_MARGIN_M)
+    _write(scan, out, options, dtm)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    _write(scan, out, options, ortho, GROUND_MARGIN_M)
+    _write(scan, out, options, ortho)
     scan.shared(("written ortho", options), lambda: out)
 
 
@@ -150,11 +150,9 @@ def written_ortho(scan: ScanView, options: ExportOptions) -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
-def _write(
-    scan: ScanView, out: Path, options: ExportOptions, make: Make[Layers], margin_m: float
-) -> None:
+def _write(scan: ScanView, out: Path, options: ExportOptions, make: Make[Layers]) -> None:
     """One kind of raster, in tiles where there are more points than one may have."""
-    cut, whole = scan.tiling(options, margin_m), None
+    cut, whole = scan.tiling(options, GROUND_MARGIN_M), None
     if len(cut.tiles) > 1:
         fixed = scan.for_tiles(options, cut)
         if make is ortho and options.cell_m is None:
@@ -162,7 +160,7 @@ def _write(
         assert fixed.cell_m is not None and fixed.voxel_m is not None
         edge = 2.0 * max(fixed.cell_m, fixed.voxel_m)
         whole, options = over(grown(cut.bounds, edge), fixed.cell_m), fixed
-    parts = in_parts(scan, make, options, margin_m)
+    parts = in_parts(scan, make, options, GROUND_MARGIN_M)
     first = next(parts)
     with mosaic(scan, out, whole or first.grid, first) as image:
         for layers in chain([first], parts):
@@ -172,7 +170,7 @@ def _write(
 def _finer(scan: ScanView, options: ExportOptions) -> float:
     """By how much pixels of the recording are finer than those of the store; 1 without one."""
     seqs, camera = main_seqs(scan.store), scan.store.header.camera
-    if source_of(scan, options) is None:
+    if recording_for(scan, options).path is None:
         return 1.0
     first = scan.store.keyframe(seqs[0])
     assert first is not None  # there is more than one tile

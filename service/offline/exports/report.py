@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from recon.surface.raster import Grid, Raster
+from recon.surface.raster import Raster
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, enu_map, open_map, over, warped
@@ -20,7 +19,7 @@ from service.scans.report import report_html
 from service.scans.writing import SUMMARY, write_whole
 
 LARGEST_CELLS = 1400
-"""Along a side of the report's maps."""
+"""Along a side of the report's maps, which are as fine as the orthophoto if these allow."""
 
 
 def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -59,7 +58,9 @@ def maps_of(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | No
     with open_map(dsm, 2) as image, open_map(ortho, 3) as colours:
         if image.tags().get("HEIGHTS") != heights:
             return None
-        grid = _in_enu(image, colours, frame)
+        box = box_around(image.bounds, None if frame is None else frame.from_utm)
+        west, south, east, north = box
+        grid = over(box, max(colours.transform.a, max(east - west, north - south) / LARGEST_CELLS))
         height, sigma, *_ = warped(image, *enu_map(grid, frame), grid.shape, is_smooth=False)
         rgb = warped(colours, *enu_map(grid, frame), grid.shape)[:3].transpose(1, 2, 0)
     known = height != NODATA_M
@@ -69,10 +70,3 @@ def maps_of(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | No
         np.where(known, sigma, np.nan).astype(np.float32),
         np.where(known[..., None], rgb, 0).astype(np.uint8),
     )
-
-
-def _in_enu(dsm: Any, ortho: Any, frame: LocalFrame | None) -> Grid:
-    """A grid over the surface model as fine as the orthophoto, or as LARGEST_CELLS allow."""
-    west, south, east, north = box_around(dsm.bounds, None if frame is None else frame.from_utm)
-    cell_m = max(ortho.transform.a, max(east - west, north - south) / LARGEST_CELLS)
-    return over((west, south, east, north), float(cell_m))

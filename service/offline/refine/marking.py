@@ -91,19 +91,21 @@ class Marking:
             raise InputError(f"{len(survey)} control points; a scan takes {MAX_POINTS} at most")
         candidates = candidates_of([p for p in survey if p.sightings], self._scan, GCP)
         frame, to_survey = self._placed(candidates)
-        out, by_name = [], {one.point.name: one for one in candidates}
-        usual = _usual_offset(candidates, to_survey)
+        why_not = {one.point.name: one.why_not for one in candidates}
+        off = {
+            one.point.name: one.off_m(to_survey.points(one.before_m))
+            for one in candidates
+            if one.before_m is not None and one.surveyed_m is not None
+        }
+        sound = [off_m for name, off_m in off.items() if not why_not[name]]
+        usual = np.asarray(np.median(sound, axis=0)) if sound else np.zeros(3)
+        out = []
         for point in survey:
-            one = by_name.get(point.name)
+            name = point.name
             expected = None if frame is None else self._expected(point, frame, to_survey, usual)
-            off = None
-            if one is not None and one.before_m is not None and one.surveyed_m is not None:
-                off = tuple(one.off_m(to_survey.points(one.before_m)).tolist())
-            out.append(
-                Marked(
-                    point, self._images(point, expected), off, "" if one is None else one.why_not
-                )
-            )
+            off_m = tuple(off[name].tolist()) if name in off else None
+            images = self._images(point, expected)
+            out.append(Marked(point, images, off_m, why_not.get(name, "")))
         return out
 
     def _placed(self, candidates: Sequence[Candidate]) -> tuple[LocalFrame | None, Similarity]:
@@ -213,16 +215,6 @@ def _distorted(flat: U8, K: F64, camera: Camera) -> U8:
     ways = rays(small.K, without_distortion(small, np.column_stack([u.ravel(), v.ravel()])))
     x, y = project(K, ways).T.reshape(2, h, w).astype(np.float32)
     return np.asarray(cv2.remap(flat, x, y, cv2.INTER_LINEAR), np.uint8)
-
-
-def _usual_offset(candidates: Sequence[Candidate], to_survey: Similarity) -> F64:
-    """(3,) by which the map has the marked points off, 0 without any."""
-    offsets = [
-        one.off_m(to_survey.points(one.before_m))
-        for one in candidates
-        if one.usable and one.before_m is not None and one.surveyed_m is not None
-    ]
-    return np.asarray(np.median(offsets, axis=0)) if offsets else np.zeros(3)
 
 
 # ---- the file of a scan --------------------------------------------------------------------------

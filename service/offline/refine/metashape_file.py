@@ -64,7 +64,7 @@ class _Reader:
                 self._labels[number] = attributes["label"]
         elif element == "reference" and "marker" in self._open and "x" in attributes:
             self._places[self._marker] = attributes
-        elif element == "location" and attributes.get("valid", "1") in ("1", "true"):
+        elif element == "location" and _is_on(attributes, "valid"):
             self._marks.append((self.parser.CurrentLineNumber, self._marker, attributes))
 
     def end(self, element: str) -> None:
@@ -93,11 +93,11 @@ class _Reader:
                     "alt_amsl_m": unit_m * float(place["z"]) if "z" in place else None,
                     "image": self._cameras[mark["camera_id"]],
                     "u_px": float(mark["x"]) - 0.5, "v_px": float(mark["y"]) - 0.5,
-                    "role": "control" if _is_enabled(place) else "check",
+                    "role": "control" if _is_on(place, "enabled") else "check",
                 }  # fmt: skip
-                for field, names in (("sigma_h_m", ("sxy", "sx")), ("sigma_v_m", ("sz",))):
-                    stated = [float(place[name]) for name in names if name in place]
-                    row |= {field: stated[0]} if stated and stated[0] > 0.0 else {}
+                across, up = place.get("sxy", place.get("sx", "0")), place.get("sz", "0")
+                sigmas = {"sigma_h_m": float(across), "sigma_v_m": float(up)}
+                row |= {name: sigma_m for name, sigma_m in sigmas.items() if sigma_m > 0.0}
             except KeyError as error:
                 raise ValueError(f"line {line}: no {error} of a mark or its marker") from error
             except ValueError as error:
@@ -105,5 +105,5 @@ class _Reader:
             yield line, row
 
 
-def _is_enabled(place: Attributes) -> bool:
-    return place.get("enabled", "true") in ("1", "true")
+def _is_on(attributes: Attributes, name: str) -> bool:
+    return attributes.get(name, "1") in ("1", "true")

@@ -118,11 +118,8 @@ def in_words(figures: dict[str, Any]) -> str:
         parts.append(f"{control['count']} control points")
     text = f"refined as a whole with {', '.join(parts)}"
     if check:
-        up_m = check["rms_v_after_m"]
-        text += f"; {check['count']} check points are off by {check['rms_h_after_m']:.2f} m "
-        text += (
-            "horizontally (rms)"
-            if up_m is None
-            else (f"horizontally and {up_m:.2f} m vertically (rms)")
-        )
+        up_m, count = check["rms_v_after_m"], check["count"]
+        up = "" if up_m is None else f" and {up_m:.2f} m vertically"
+        flat = f"{check['rms_h_after_m']:.2f} m horizontally"
+        text += f"; {count} check points are off by {flat}{up} (rms)"
     return text

@@ -63,8 +63,7 @@ def gather(
     starts = starts or {}
     with ExitStack() as stack:
         stores = [stack.enter_context(_opened(folder)) for folder in folders]
-        chosen, notes = _chosen(folders, stores, starts)
-        origin = _frame(chosen[0][1].header)
+        chosen, origin, notes = _chosen(folders, stores, starts)
         header = _site_header(name, [s.header for _, s in chosen], origin)
         members: list[Member] = []
         with ScanStore.create(path, header) as site:
@@ -91,8 +90,8 @@ def _opened(folder: Path) -> ScanStore:
 
 def _chosen(
     folders: Sequence[Path], stores: Sequence[ScanStore], starts: Mapping[Path, list[Pair]]
-) -> tuple[list[tuple[Path, ScanStore]], list[str]]:
-    """The scans that can be part of a site, and why others cannot."""
+) -> tuple[list[tuple[Path, ScanStore]], LocalFrame, list[str]]:
+    """The scans that can be part of a site, its origin, and why others cannot."""
     chosen: list[tuple[Path, ScanStore]] = []
     notes: list[str] = []
     for folder, store in zip(folders, stores, strict=True):
@@ -109,42 +108,36 @@ def _chosen(
         else:
             chosen.append((folder, store))
     chosen.sort(key=lambda one: local_frame(one[1].header) is None)
-    located = [one for one in chosen if local_frame(one[1].header) is not None]
+    frames = [(folder, local_frame(store.header)) for folder, store in chosen]
+    located = [(folder, frame) for folder, frame in frames if frame is not None]
     if not located:
         raise InputError("; ".join(["no usable scan with a georeference for a site", *notes]))
-    origin = _frame(located[0][1].header)
-    for folder, store in located:
+    origin = located[0][1]
+    for folder, frame in located:
         if folder.resolve() in starts:
             raise InputError(f"{folder} has a georeference; --start is for scans without one")
-        away = float(np.linalg.norm(between_frames(origin, _frame(store.header))[:3, 3]))
+        away = float(np.linalg.norm(between_frames(origin, frame)[:3, 3]))
         if away > MAX_DISTANCE_M:
             raise InputError(f"{folder} lies {away / 1e3:.0f} km from {chosen[0][0]}: not one site")
-    zones = {_frame(s.header).epsg for _, s in located}
+    zones = {frame.epsg for _, frame in located}
     if len(zones) > 1:
         notes.append(f"scans of several zones {sorted(zones)}: the site takes EPSG {origin.epsg}")
-    return chosen, notes
+    return chosen, origin, notes
 
 
 def _is_same_flight(a: ScanStore, b: ScanStore) -> bool:
     """True for one scan, or for two replays of one recording."""
     if a.header.identity == b.header.identity:
         return True
-    located = local_frame(a.header) is not None and local_frame(b.header) is not None
-    if a.header.started_unix_ns != b.header.started_unix_ns or not located:
+    here, there = local_frame(a.header), local_frame(b.header)
+    if here is None or there is None or a.header.started_unix_ns != b.header.started_unix_ns:
         return False
     one, two = (s.poses()[:1] for s in (a, b))
     if not one or not two or one[0].time_unix_ns != two[0].time_unix_ns:
         return False
-    T = between_frames(_frame(a.header), _frame(b.header))
+    T = between_frames(here, there)
     apart = se3.inverse(one[0].T_world_camera) @ T @ two[0].T_world_camera
     return float(np.linalg.norm(apart[:3, 3])) < 5.0 and bool(np.trace(apart[:3, :3]) > 2.97)
-
-
-def _frame(header: ScanHeader) -> LocalFrame:
-    frame = local_frame(header)
-    if frame is None:
-        raise ValueError(f"{header.scan_id} has no georeference")
-    return frame
 
 
 def _site_header(name: str, headers: Sequence[ScanHeader], origin: LocalFrame) -> ScanHeader:

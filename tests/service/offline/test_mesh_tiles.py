@@ -324,7 +324,7 @@ def test_models_share_surface_images_and_texture(
     pytest.importorskip("trimesh")
     house.flown(tmp_path).close()
     volume = spied(monkeypatch, model, "volume_mesh")
-    read = spied(monkeypatch, images, "scan_images")
+    read = spied(monkeypatch, images, "stored_images")
     texture = spied(monkeypatch, model, "texture")
     options = ExportOptions(voxel_m=1.0, stored=True)
     with ScanView(tmp_path, 1.0) as scan:
