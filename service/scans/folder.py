@@ -30,7 +30,6 @@ from service.memory import release_memory
 from service.progress import CancelledError, Progress
 from service.redaction import public_configuration, redacted
 from service.scans import drawing, track
-from service.scans.absolute import SharedSigma, shared_sigma
 from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, LiveCoverage, write_coverage_files
 from service.scans.fused_cloud import (
@@ -45,7 +44,7 @@ from service.scans.fused_cloud import (
 )
 from service.scans.main_piece import in_words, main_poses, main_seqs, pieces_apart, stretches_apart
 from service.scans.report import report_html
-from service.scans.trust import scale_sigma, slope_deg, trust_of
+from service.scans.trust import SharedSigma, scale_sigma, shared_sigma, slope_deg, trust_of
 from service.scans.writing import SUMMARY, write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore

@@ -24,8 +24,8 @@ from recon.types import F64, I64, U8, Keyframe, PointCloud
 from service.georeference import LocalFrame, map_crs
 from service.memory import release_memory
 from service.progress import Progress
-from service.scans.absolute import SharedSigma
 from service.scans.main_piece import Keyframes, main_keyframes
+from service.scans.trust import SharedSigma
 
 if TYPE_CHECKING:
     import laspy

@@ -22,10 +22,10 @@ from service.offline.exports import EXPORTERS, MAPPED, PACKAGES, kind_of
 from service.offline.tiles import TILE_POINTS, Tile, Tiling, run_tiles, tiling
 from service.packages import needing
 from service.progress import Progress
-from service.scans.absolute import SharedSigma, shared_sigma
 from service.scans.fused_cloud import EVERYWHERE, Box, FusedCloud, fused_cloud, placed
 from service.scans.main_piece import main_keyframes, main_track
 from service.scans.track import flown_datum, local_frame
+from service.scans.trust import SharedSigma, shared_sigma
 from service.scans.writing import check_writable
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.scans.absolute import SharedSigma
+from service.scans.trust import SharedSigma
 from service.stream.records import PoseRecord
 
 FLIGHTS, AGL_M = 2000, 40.0
