@@ -147,75 +147,61 @@ class UdpPort:
 
 
 class TcpPort:
-    """A connection to a server."""
+    """A connection to a server (tcp), or a server for a few clients at once (tcpin)."""
 
     is_quick = False
 
     def __init__(self, spec: LinkSpec) -> None:
-        self._socket = socket.create_connection((spec.place, spec.number), timeout=3.0)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        place = spec.place, spec.number
+        self._servers, self._peers = list[socket.socket](), list[socket.socket]()
+        if spec.kind == "tcpin":
+            self._servers.append(socket.create_server(place))
+        else:
+            self._peers.append(socket.create_connection(place, timeout=3.0))
+            self._peers[0].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def read(self) -> bytes:
-        if not _ready([self._socket]):
-            return b""
-        data = self._socket.recv(LONGEST)
-        if not data:
-            raise ConnectionResetError("closed by the other end")
-        return data
-
-    def write(self, data: bytes) -> None:
-        self._socket.sendall(data)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-class TcpServerPort:
-    """A server for a few clients at once."""
-
-    is_quick = False
-
-    def __init__(self, spec: LinkSpec) -> None:
-        self._server = socket.create_server((spec.place, spec.number))
-        self._clients: list[socket.socket] = []
-
-    def read(self) -> bytes:
-        """Received data of any client."""
+        """Received data of any peer."""
         data = b""
-        for source in _ready([self._server, *self._clients]):
-            if source is self._server:
-                client, _ = self._server.accept()
-                client.settimeout(1.0)
-                if len(self._clients) < MAX_PEERS:
-                    self._clients.append(client)
-                else:
-                    client.close()
+        for source in _ready([*self._servers, *self._peers]):
+            if source in self._servers:
+                self._accept(source)
                 continue
             try:
                 got = source.recv(LONGEST)
-            except OSError:
-                got = b""
-            if not got:
-                self._drop(source)
-            data += got
+                if not got:
+                    raise ConnectionResetError("closed by the other end")
+                data += got
+            except OSError as error:
+                self._lose(source, error)
         return data
 
     def write(self, data: bytes) -> None:
-        for client in list(self._clients):
+        for peer in list(self._peers):
             try:
-                client.sendall(data)
-            except OSError:
-                self._drop(client)
+                peer.sendall(data)
+            except OSError as error:
+                self._lose(peer, error)
 
-    def _drop(self, client: socket.socket) -> None:
+    def _accept(self, server: socket.socket) -> None:
+        client, _ = server.accept()
+        client.settimeout(1.0)
+        if len(self._peers) < MAX_PEERS:
+            self._peers.append(client)
+        else:
+            client.close()
+
+    def _lose(self, peer: socket.socket, error: OSError) -> None:
+        """Drop a client; without its server the link has failed."""
+        if not self._servers:
+            raise error
         with contextlib.suppress(ValueError):
-            self._clients.remove(client)
-        client.close()
+            self._peers.remove(peer)
+        peer.close()
 
     def close(self) -> None:
-        for client in list(self._clients):
-            self._drop(client)
-        self._server.close()
+        for one in [*self._peers, *self._servers]:
+            one.close()
 
 
 def _ready(sockets: Sequence[socket.socket]) -> list[socket.socket]:
@@ -253,7 +239,7 @@ PORTS: dict[str, Callable[[LinkSpec], Port]] = {
     "udpin": UdpPort,
     "udpout": UdpPort,
     "tcp": TcpPort,
-    "tcpin": TcpServerPort,
+    "tcpin": TcpPort,
     "lines": LinesPort,
 }
 """Kind of link to its port. A new kind is one class and one line."""

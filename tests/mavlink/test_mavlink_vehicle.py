@@ -21,7 +21,7 @@ from mavlink.component.vehicle import VehicleConfig
 from mavlink.telemetry.logs import load_telemetry
 from mavlink.wire.dialect import dialect
 from mavlink.wire.link import LinkSpec, parse_link
-from mavlink.wire.ports import MAX_PEERS, PORTS, READ_S, TcpServerPort, UdpPort
+from mavlink.wire.ports import MAX_PEERS, PORTS, READ_S, TcpPort, UdpPort
 from mavlink.wire.tlog import TlogRecorder, packets
 
 S = 1_000_000_000
@@ -104,13 +104,13 @@ def test_the_newest_peers_of_a_port_are_answered() -> None:
 def test_a_client_that_is_dropped_while_others_are_read_ends_nothing() -> None:
     at = LinkSpec("tcpin", "127.0.0.1", free_port(socket.SOCK_STREAM))
     with (
-        contextlib.closing(TcpServerPort(at)) as port,
+        contextlib.closing(TcpPort(at)) as port,
         socket.create_connection((at.place, at.number)) as client,
     ):
-        until(lambda: port.read() or port._clients)
+        until(lambda: port.read() or port._peers)
         gone = socket.socket()
         gone.close()  # as the writing thread closes one
-        port._clients.append(gone)
+        port._peers.append(gone)
         client.sendall(b"x")
         assert until(port.read) == b"x"
 
