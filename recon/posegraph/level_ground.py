@@ -29,6 +29,10 @@ MAX_THICKNESS = 0.2
 """Spread across a plane over its width; thicker ground has no normal."""
 
 
+ROUNDS = 8
+"""Fits of a plane, each with the weights of the one before."""
+
+
 def levelled(prior: PosePrior, points: F64) -> PosePrior:
     """The prior with the tilt that lays the ground level, where the assumed mount is far from it.
 
@@ -54,19 +58,19 @@ def plane_normal(points: F64) -> F64 | None:
     or where they lie on no plane."""
     if len(points) < MIN_POINTS:
         return None
-    near, spread, normal = plane_through(points)
-    if len(near) < MIN_POINTS or not spread[0] < MAX_THICKNESS**2 * spread[1]:
+    normal, size = plane_through(points)
+    if not size[2] < MAX_THICKNESS * size[1]:
         return None
-    return np.asarray(-normal if normal @ np.median(near, axis=0) > 0 else normal, np.float64)
+    return np.asarray(-normal if normal @ np.median(points, axis=0) > 0 else normal, np.float64)
 
 
-def plane_through(points: F64) -> tuple[F64, F64, F64]:
-    """Points (N, 3) without those far off the plane through them, their summed squares along its
-    three axes, smallest first, and its unit normal (3,), the direction of minimum spread."""
-    for _ in range(3):
-        near, about = points, points - np.median(points, axis=0)
-        spread, axes = np.linalg.eigh(about.T @ about)
-        off = np.abs(about @ axes[:, 0])
-        limit = 3.0 * float(np.median(off))
-        points = near[off <= limit] if limit > 0.0 else near
-    return near, spread, np.asarray(axes[:, 0])
+def plane_through(points: F64) -> tuple[F64, F64]:
+    """(3,) unit normal of the plane that most of three or more points (N, 3) lie near, and their
+    extent along its three axes (3,), largest first. Weights are the inverse of the distance."""
+    weight = np.ones(len(points))
+    for _ in range(ROUNDS):
+        about = points - weight @ points / weight.sum()
+        _, size, rows = np.linalg.svd(about * np.sqrt(weight)[:, None], full_matrices=False)
+        off = np.abs(about @ rows[2])
+        weight = 1.0 / np.maximum(off, max(float(np.median(off)), 1e-6))
+    return np.asarray(rows[2]), size

@@ -15,6 +15,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import project, rays
 from recon.mapping.registration import agreed_motion, register_projective
+from recon.posegraph.level_ground import plane_through
 from recon.tracking import matching, pnp
 from recon.tracking.sift_features import FEATURE_SHARES, features, match_features
 from recon.types import F32, F64, I64, U8, Bool, DepthMap
@@ -74,18 +75,11 @@ def plane_normal(points: F64) -> F64:
 
     Of fewer than three points, or points in a line, the camera's axis.
     """
-    weight, normal = np.ones(len(points)), np.array([0.0, 0.0, 1.0])
-    if len(points) < 3:
-        return normal
-    for _ in range(8):
-        about = points - weight @ points / weight.sum()
-        _, size, rows = np.linalg.svd(about * np.sqrt(weight)[:, None], full_matrices=False)
-        if size[1] < 0.02 * size[0]:
-            return np.array([0.0, 0.0, 1.0])
-        normal = rows[2] * np.sign(rows[2, 2] if rows[2, 2] else 1.0)
-        off = np.abs(about @ normal)
-        weight = 1.0 / np.maximum(off, max(float(np.median(off)), 1e-6))
-    return np.asarray(normal)
+    if len(points) >= 3:
+        normal, size = plane_through(points)
+        if size[1] >= 0.02 * size[0]:
+            return np.asarray(normal * np.sign(normal[2] if normal[2] else 1.0))
+    return np.array([0.0, 0.0, 1.0])
 
 
 def candidates(

@@ -222,11 +222,11 @@ def _number(document: Any, key: str) -> float | None:
 def slope_deg(xyz_m: Array) -> float:
     """The angle in degrees between the plane through points (N, 3) and the horizontal.
 
-    The normal is the direction of minimum spread; 0 for fewer than three points.
+    0 for fewer than three points.
     """
     if len(xyz_m) < 3:
         return 0.0
-    _, _, normal = plane_through(xyz_m[:: max(1, len(xyz_m) // 20_000)].astype(np.float64))
+    normal, _ = plane_through(xyz_m[:: max(1, len(xyz_m) // 20_000)].astype(np.float64))
     return float(np.degrees(np.arccos(min(1.0, abs(normal[2])))))
 
 
