@@ -29,6 +29,7 @@ from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of
 from service.offline.exports.view import USUAL, ExportOptions, ScanView
+from service.offline.refine.revisions import NEWEST, Revisions
 from service.offline.refine.stored_loops import BREAK_S, stored_loops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
@@ -256,22 +257,18 @@ def _joined(
     store: ScanStore, members: Sequence[Member]
 ) -> tuple[KeyframeTrack, list[int], list[int]]:
     """All keyframes one scan after the other, their numbers in the store, and their scans."""
-    poses, spread, seqs, scans = [], [], [], []
-    times: list[float] = []
-    for k, member in enumerate(members):
-        begun = max(times, default=0.0) + 10.0 * BREAK_S  # scans may have been flown at once
-        first = None
-        for seq in member.seqs:
-            one = store.keyframe(seq)
-            if one is None:
-                continue
-            first = one.time_ns if first is None else first
-            poses.append(one.depth.T_world_camera)
-            spread.append(one.pose.covariance)
-            times.append(begun + (one.time_ns - first) * 1e-9)
-            seqs.append(seq)
-            scans.append(k)
-    return KeyframeTrack(np.array(poses), np.array(times), np.array(spread)), seqs, scans
+    states = Revisions(store).states(NEWEST)
+    order = np.argsort(states.seqs)
+    seqs = np.array(states.seqs)[order]
+    scans = np.searchsorted([member.last for member in members], seqs)
+    times_s = np.zeros(len(seqs))
+    for k in range(len(members)):
+        own_ns = states.times_ns[order][scans == k]
+        if len(own_ns):  # scans may have been flown at once
+            begun_s = times_s.max() + 10.0 * BREAK_S
+            times_s[scans == k] = begun_s + (own_ns - own_ns[0]) * 1e-9
+    track = KeyframeTrack(states.poses[order], times_s, states.covariances[order])
+    return track, seqs.tolist(), scans.tolist()
 
 
 def corners(one: Keyframe) -> F64:
