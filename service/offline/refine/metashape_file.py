@@ -6,7 +6,7 @@ whose place Metashape did not use (``enabled``) is a check point.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 from xml.parsers import expat
 
@@ -35,6 +35,20 @@ def read_metashape(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
     except expat.ExpatError as error:
         raise ValueError(f"not XML: {error}") from error
     yield from reader.rows()
+
+
+def places_in(system: str) -> Callable[[str, str, str | None], dict[str, Any]]:
+    """What makes of x, y and z in a surveyor's coordinate system the fields of a place; without z
+    its height is not known. Both raise ValueError."""
+    to_degrees, datum, unit_m = system_of(system)
+    if datum == "ellipsoid":
+        raise ValueError("heights above mean sea level are needed, not ellipsoidal")
+
+    def place(x: str, y: str, z: str | None) -> dict[str, Any]:
+        lon, lat = degrees_of(to_degrees, float(x), float(y))
+        return {"lat": lat, "lon": lon, "alt_amsl_m": None if z is None else unit_m * float(z)}
+
+    return place
 
 
 class _Reader:
@@ -79,18 +93,14 @@ class _Reader:
         """The marks of markers that have a place."""
         if not self._system:
             raise ValueError("it names no coordinate system; export the markers with one")
-        system, datum, unit_m = system_of(self._system)
-        if datum == "ellipsoid":
-            raise ValueError("heights above mean sea level are needed, not ellipsoidal")
+        place_of = places_in(self._system)
         for line, marker, mark in self._marks:
             place = self._places.get(marker)
             if place is None:
                 continue
             try:
-                lon, lat = degrees_of(system, float(place["x"]), float(place["y"]))
-                row = {
-                    "name": self._labels.get(marker, f"point {marker}"), "lat": lat, "lon": lon,
-                    "alt_amsl_m": unit_m * float(place["z"]) if "z" in place else None,
+                row = place_of(place["x"], place["y"], place.get("z")) | {
+                    "name": self._labels.get(marker, f"point {marker}"),
                     "image": self._cameras[mark["camera_id"]],
                     "u_px": float(mark["x"]) - 0.5, "v_px": float(mark["y"]) - 0.5,
                     "role": "control" if _is_on(place, "enabled") else "check",

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -27,12 +27,9 @@ from msgspec import Meta
 
 from recon.types import F64
 from service.errors import InputError
-from service.georeference import LocalFrame, degrees_of, is_system, system_of
-from service.offline.refine.metashape_file import read_metashape
+from service.georeference import LocalFrame, is_system
+from service.offline.refine.metashape_file import places_in, read_metashape
 from service.small_file import read_small
-
-if TYPE_CHECKING:
-    from pyproj import Transformer
 
 LARGEST_BYTES = 10_000_000
 
@@ -204,15 +201,13 @@ def _pix4d_marks(path: Path) -> dict[str, list[Sighting]]:
 def _marked(path: Path, lines: Sequence[str], marks: Path | None) -> list[SurveyPoint]:
     """The points below the coordinate system in ``lines``, with their sightings in ``marks``."""
     seen = {} if marks is None else _pix4d_marks(marks)
-    (system, unit_m), points = _system(path, lines), dict[str, SurveyPoint]()
+    place_of, points = _places(path, lines), dict[str, SurveyPoint]()
     for number, cells in _cells(lines[1:], 2):
         where = f"{path} line {number}"
         with _fault_in(f"{where}: name, x, y, z and accuracies"):
             name, x, y, z, *sigmas = cells
-            lon, lat = degrees_of(system, float(x), float(y))
             named = dict(zip(("sigma_h_m", "sigma_v_m"), map(float, sigmas[:2]), strict=False))
-            row = {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": unit_m * float(z), **named}
-            point = _point(number, row)
+            point = _point(number, {"name": name, **place_of(x, y, z), **named})
         name = point.name
         if name in points:
             raise InputError(f"{where}: {name} is also in line {points[name].line}")
@@ -248,18 +243,15 @@ def is_list(lines: Sequence[str]) -> bool:
     return len(next(rows, ())) >= LIST_COLUMNS and "lat" not in lines[0].split(",")
 
 
-def _system(path: Path, lines: Sequence[str]) -> tuple[Transformer, float]:
-    """The coordinate system in the first line, and the unit of its heights in metres."""
+def _places(path: Path, lines: Sequence[str]) -> Callable[[str, str, str | None], dict[str, Any]]:
+    """:func:`places_in` of the coordinate system in the first line."""
     with _fault_in(f"{path} line 1"):
-        system, datum, unit_m = system_of(lines[0] if lines else "")
-        if datum == "ellipsoid":
-            raise ValueError("heights above mean sea level are needed, not ellipsoidal")
-    return system, unit_m
+        return places_in(lines[0] if lines else "")
 
 
 def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
     """Each row of a ``gcp_list.txt``."""
-    system, unit_m = _system(path, lines)
+    place_of = _places(path, lines)
     table = [(n, s.split()) for n, s in enumerate(lines[1:], 2) if s.strip() and s[0] != "#"]
     is_flat = all(
         cells[2:3] in (["0"], ["0.0"], ["0.00"], ["0.000"], ["NaN"]) for _, cells in table
@@ -270,10 +262,8 @@ def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
             if len(cells) < LIST_COLUMNS:
                 raise ValueError(f"{len(cells)} columns; x, y, z, u, v and an image are needed")
             name = names.setdefault(tuple(cells[:3]), f"point {len(names) + 1}")
-            lon, lat = degrees_of(system, float(cells[0]), float(cells[1]))
-            row = {
-                "name": cells[6] if len(cells) > LIST_COLUMNS else name, "lat": lat, "lon": lon,
-                "alt_amsl_m": None if is_flat else unit_m * float(cells[2]),
+            row = place_of(cells[0], cells[1], None if is_flat else cells[2]) | {
+                "name": cells[6] if len(cells) > LIST_COLUMNS else name,
                 "u_px": float(cells[3]), "v_px": float(cells[4]), "image": cells[5],
             }  # fmt: skip
         yield number, row
