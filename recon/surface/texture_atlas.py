@@ -20,6 +20,9 @@ BORDER_PX = 2
 """Texels around a chart that repeat its colours, for filtering and the first mip levels."""
 
 MAX_SCALE, MIN_SCALE = 2.0, 1 / 64
+BAND_ROWS = 512
+"""Rows of the atlas whose borders are made at a time."""
+
 CELL_PX = 4
 """Side of the square that holds a triangle which no view sees."""
 
@@ -154,7 +157,7 @@ def paint(mesh: Mesh, layout: Layout, found: TriangleViews, label: I32, palette:
         found.view, palette.fade_view, palette.fade_share, palette.rgb, pixels, start, sides,
         *cameras(views), palette.levels, image, done,
     )  # fmt: skip
-    return _bordered(image, done)
+    return bordered(image, done)
 
 
 def cameras(views: Sequence[TextureView]) -> tuple[F64, F64]:
@@ -174,11 +177,20 @@ def flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
     return pixels, start, sides
 
 
-def _bordered(image: U8, done: Bool) -> U8:
+def bordered(image: U8, done: Bool) -> U8:
     """The charts' colours carried a few texels past their edges."""
+    out, reach = np.empty_like(image), BORDER_PX + 1
+    for top in range(0, len(image), BAND_ROWS):  # in single precision an atlas takes a gigabyte
+        first, end = max(top - reach, 0), top + BAND_ROWS
+        whole = _carried(image[first : end + reach], done[first : end + reach], reach)
+        out[top:end] = whole[top - first : end - first]
+    return out
+
+
+def _carried(image: U8, done: Bool, steps: int) -> U8:
     reached = done.copy()
     out = image.astype(np.float32)
-    for _ in range(BORDER_PX + 1):
+    for _ in range(steps):
         weight = reached.astype(np.float32)
         total = cv2.boxFilter(weight, -1, (3, 3), normalize=False)
         new = ~reached & (total > 0.5)

@@ -11,7 +11,7 @@ from sheets import height_mesh
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut
 from recon.surface.raster import Grid, Raster
-from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
+from recon.surface.texture_atlas import BAND_ROWS, BORDER_PX, bordered, lay_out, pack
 from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
 from recon.surface.texturing import (
     PENALTY,
@@ -296,3 +296,14 @@ def test_cutting_divides_triangles_at_the_border() -> None:
     for part in (west, east):
         assert (np.cross(*edges(part))[:, 2] > -1e-9).all() and part.rgb is not None
     assert len(cut(mesh, (50.0, 50.0, 60.0, 60.0)).faces) == 0
+
+
+def test_colours_are_carried_past_the_edges_of_charts_alike_in_all_rows() -> None:
+    image, done = np.zeros((BAND_ROWS + 50, 40, 3), np.uint8), np.zeros((BAND_ROWS + 50, 40), bool)
+    done[2:-5, 10] = True
+    image[done] = 10, 20, 30
+    near = BORDER_PX + 1
+    out = bordered(image, done)
+    assert (out[: -5 + near, 10 - near : 11 + near] == [10, 20, 30]).all()
+    out[: -5 + near, 10 - near : 11 + near] = 0
+    assert not out.any()
