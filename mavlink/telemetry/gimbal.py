@@ -129,32 +129,33 @@ class FrameVerdict:
 
 
 Ends = tuple[Quaternion, Quaternion]
-"""A rotation at the first and at the second of two images."""
+"""Two rotations: at the first and at the second of two images, or as sent and the body's."""
 
 Turn = tuple[int, int, Quaternion]
 """Times in ns of two images, and ``q_head(first)_head(second)`` as seen, in the head's axes."""
 
 
-def judge_frame(
-    q_sent: Sequence[Ends], q_ned_body: Sequence[Ends], q_seen_steps: Sequence[Quaternion]
+def frame_by_images(
+    turns: Sequence[Turn],
+    claimed_at: Callable[[int], Ends | None],
+    latency_ms: float = 0.0,
 ) -> FrameVerdict | None:
-    """The frame of a gimbal's quaternions that agrees with the rotation seen by the camera.
+    """The frame of a gimbal's quaternions that agrees with the turns of its head as seen.
 
-    For N pairs of images: the quaternions sent by the gimbal and the body's attitude at both, and
-    the rotation ``q_head(first)_head(second)`` measured between them, in the head's axes. None
-    without pairs. ``decided`` requires the best frame to disagree less than half as much as
-    every other frame with a different meaning.
+    ``claimed_at(time_ns)`` gives the gimbal's quaternion as sent, and ``q_ned_body``. None with
+    fewer than twenty turns. ``decided`` requires the best frame to disagree less than half as much
+    as every other frame with a different meaning.
     """
-    if not q_sent:
+    shift = round(latency_ms * 1e6)
+    claims = [(claimed_at(a - shift), claimed_at(b - shift), seen) for a, b, seen in turns[-KEPT:]]
+    known = [(a, b, seen) for a, b, seen in claims if a is not None and b is not None]
+    if len(known) < MIN_TURNS:
         return None
     heads: dict[GimbalFrame, list[Ends]] = {
-        frame: [
-            (to_earth(a, frame, body_a), to_earth(b, frame, body_b))
-            for (a, b), (body_a, body_b) in zip(q_sent, q_ned_body, strict=True)
-        ]
+        frame: [(to_earth(a[0], frame, a[1]), to_earth(b[0], frame, b[1])) for a, b, _ in known]
         for frame in GimbalFrame
     }
-    rms = {frame: _disagreement(heads[frame], q_seen_steps) for frame in GimbalFrame}
+    rms = {frame: _disagreement(heads[frame], [seen for *_, seen in known]) for frame in heads}
     best = min(rms, key=lambda frame: rms[frame])
     # A frame that always gives the same attitudes is not a rival.
     rivals = [f for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
@@ -177,21 +178,3 @@ def _largest_angle(a: Sequence[Ends], b: Sequence[Ends]) -> float:
     return max(
         angle_between(p, q) for pair in zip(a, b, strict=True) for p, q in zip(*pair, strict=True)
     )
-
-
-def frame_by_images(
-    turns: Sequence[Turn],
-    claimed_at: Callable[[int], Ends | None],
-    latency_ms: float = 0.0,
-) -> FrameVerdict | None:
-    """The frame that agrees with the images; None with fewer than twenty rotations.
-
-    ``claimed_at(time_ns)`` gives the gimbal's quaternion as sent, and ``q_ned_body``.
-    """
-    shift = round(latency_ms * 1e6)
-    claims = [(claimed_at(a - shift), claimed_at(b - shift), seen) for a, b, seen in turns[-KEPT:]]
-    known = [(a, b, seen) for a, b, seen in claims if a is not None and b is not None]
-    if len(known) < MIN_TURNS:
-        return None
-    sent, bodies = ([(a[k], b[k]) for a, b, _ in known] for k in range(2))
-    return judge_frame(sent, bodies, [seen for *_, seen in known])

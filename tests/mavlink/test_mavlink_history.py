@@ -14,7 +14,6 @@ from mavlink.telemetry import quaternion
 from mavlink.telemetry.gimbal import (
     frame_by_images,
     frame_of_flags,
-    judge_frame,
     steadiest_frame,
     to_earth,
 )
@@ -489,10 +488,11 @@ def test_the_images_decide_between_frames() -> None:
     assert history.gimbal_frame() is GimbalFrame.SERVO  # the configuration stands
 
 
-def test_judging_needs_matching_lists() -> None:
-    ends = (IDENTITY, IDENTITY)
-    assert judge_frame([], [], []) is None
-    still = judge_frame([ends], [ends], [IDENTITY])
+def test_a_head_that_stands_still_decides_nothing() -> None:
+    turns = [(k * S, (k + 1) * S, IDENTITY) for k in range(20)]
+    assert frame_by_images([], lambda _: (IDENTITY, IDENTITY)) is None
+    assert frame_by_images(turns, lambda _: None) is None
+    still = frame_by_images(turns, lambda _: (IDENTITY, IDENTITY))
     assert still is not None and not still.decided
 
 
