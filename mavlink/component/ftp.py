@@ -160,7 +160,7 @@ def _name(r: FtpRequest) -> str:
     return SELECTOR.sub("", path)
 
 
-def _ack(r: FtpRequest, data: bytes, step: int = 0, last: bool = False, **changed: int) -> bytes:
+def _ack(r: FtpRequest, data: bytes, step: int = 0, last: bool = False, **changed: Any) -> bytes:
     """The answer; ``changed`` is the session or the offset where it is not the request's."""
     return _payload(replace(r, **changed), ACK, data, step, last)
 
