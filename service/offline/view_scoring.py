@@ -73,9 +73,11 @@ class Triangles:
 
 
 def score_views(
-    scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {}
-) -> dict[str, Any]:
-    """Figures of each product, and of ``others``, at the frames of ``video`` that took no part.
+    scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {},
+    every: int = EVERY,
+) -> dict[str, Any]:  # fmt: skip
+    """Figures of each product, and of ``others``, at every so many frames of ``video`` that took no
+    part.
 
     ``images`` is a folder for each frame beside what was drawn of it, as PNG. Raises InputError
     when the video is not the scan's, or has no such frame.
@@ -87,13 +89,14 @@ def score_views(
             "psnr_db": round(float(np.mean([r[1] for r in rows])), 2),
             "ssim": round(float(np.mean([r[2] for r in rows])), 4),
         }
-        for name, rows in frame_scores(scan, video, images, others).items()
+        for name, rows in frame_scores(scan, video, images, others, every).items()
     }
 
 
 def frame_scores(
-    scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {}
-) -> dict[str, list[tuple[float, float, float]]]:
+    scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {},
+    every: int = EVERY,
+) -> dict[str, list[tuple[float, float, float]]]:  # fmt: skip
     """Share covered, PSNR in dB and SSIM of each frame, by product; as ``score_views`` else."""
     with needing("score --views"):
         import open3d  # noqa: F401
@@ -102,7 +105,7 @@ def frame_scores(
     products = {**_products(scan, keyframes, camera), **others}
     inside, undistort = _outline(scan), Undistorter(camera)
     scores: dict[str, list[tuple[float, float, float]]] = {name: [] for name in products}
-    for n, (T, seen) in enumerate(_seen(scan, keyframes, undistort, video)):
+    for n, (T, seen) in enumerate(_seen(scan, keyframes, undistort, video, every)):
         counts = inside(camera, T) & (undistort.valid > 0)
         if counts.mean() < 0.5:
             continue
@@ -128,14 +131,14 @@ def frame_scores(
 
 
 def _seen(
-    scan: ScanView, keyframes: Sequence[Keyframe], undistort: Undistorter, video: Path
+    scan: ScanView, keyframes: Sequence[Keyframe], undistort: Undistorter, video: Path, every: int
 ) -> Iterator[tuple[F64, U8]]:
     """T_world_camera (4, 4) and image without distortion of each frame that took no part.
 
     Stills of a folder that the scan does not know are placed by its surface.
     """
     header, start_ns = scan.store.header, scan.store.header.started_unix_ns
-    poses = left_out(scan.poses, {k.time_ns for k in keyframes})
+    poses = left_out(scan.poses, {k.time_ns for k in keyframes}, every)
     if poses:
         times = [p.time_unix_ns for p in poses]
         for n, frame in frames_at(times, header, video, None, scan.progress):
@@ -202,9 +205,11 @@ def _features(bgr: U8) -> Features:
     return features(gray, FINE_WIDTH_PX, FINE_MOST, are_strongest=True)
 
 
-def left_out(poses: Sequence[PoseRecord], used_ns: set[int]) -> list[PoseRecord]:
-    """Every EVERY-th pose of a frame that is no keyframe."""
-    return [p for p in poses if p.time_unix_ns not in used_ns and p.keyframe_seq is None][::EVERY]
+def left_out(
+    poses: Sequence[PoseRecord], used_ns: set[int], every: int = EVERY
+) -> list[PoseRecord]:
+    """Every so many poses of the frames that are no keyframes."""
+    return [p for p in poses if p.time_unix_ns not in used_ns and p.keyframe_seq is None][::every]
 
 
 def _products(scan: ScanView, keyframes: Sequence[Keyframe], camera: Camera) -> dict[str, Draw]:

@@ -45,6 +45,9 @@ KINDS = ("ortho", "dsm", "contours", "glb", "splat")
 WINDOWS, WINDOW_PX = 3, 420
 EDGES, EDGE_PX, EDGE_M, EDGE_STEP_M = 20, 150, 3.0, 1.5
 """Roof edges: how many, the side of their images, their least length and height."""
+EVERY = 100
+"""Of the frames that took no part; each takes seconds."""
+
 SIDE_PX = (640, 480)
 SIDES = {"above": (0, 90), "the north": (0, 35), "the east": (90, 35), "the south": (180, 35),
          "the west": (270, 35)}  # fmt: skip
@@ -219,14 +222,19 @@ class Page:
         self.parts.append("</div>")
 
 
-def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) -> None:
-    """All rows of one scan."""
-    folder, options, name = scan.folder, ExportOptions(), html.escape(scan.folder.name)
+def make_products(scan: ScanView) -> None:
+    """What the scan lacks of KINDS."""
+    folder = scan.folder
     missing = [kind for kind in KINDS if not (folder / EXPORTERS[kind][1]).is_file()]
     failures = Failures(folder)
-    write_kinds(scan, missing, lambda kind: folder / EXPORTERS[kind][1], options, failures)
+    write_kinds(scan, missing, lambda kind: folder / EXPORTERS[kind][1], ExportOptions(), failures)
     if failures.first is not None and {"ortho", "dsm"} & set(failures.why):
         raise failures.first
+
+
+def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) -> None:
+    """All rows of one scan, which has its products."""
+    folder, name = scan.folder, html.escape(scan.folder.name)
     with open_map(folder / "ortho.tif", 3) as image:
         cell_m = float(image.transform.a)
     with open_map(folder / "dsm.tif") as image:
@@ -263,7 +271,7 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
         for images in rows(window(place, cell_m, WINDOW_PX)).values():
             page.row(images)
     page.parts.append(f"<h2>{name}: roof edges, the frame laid on the roof's level first</h2>")
-    views = shared_images(scan, options)
+    views = shared_images(scan, ExportOptions())
     sheet = []
     for place, height_m in roofs:
         grid = window(place, cell_m, EDGE_PX)
@@ -280,7 +288,7 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
         page.row({f"{side}, {when}": one[side] for when, one in sides.items() if side in one})
     page.parts.append(f"<h2>{name}: frames that took no part</h2>")
     video = flight / "flight.mp4"
-    for what, found in score_views(scan, video if video.is_file() else flight).items():
+    for what, found in score_views(scan, video if video.is_file() else flight, every=EVERY).items():
         figures = ", ".join(f"{key} {value}" for key, value in found.items())
         page.parts.append(f"<p>{what}: {figures}</p>")
 
@@ -295,8 +303,11 @@ def main(
         raise SystemExit("give SCAN FLIGHT for each flight, and --before for each or none")
     page = Page(out)
     for n, (folder, flight) in enumerate(zip(scans[::2], scans[1::2], strict=True)):
-        with showing("sheets") as progress, ScanView(folder, progress=progress) as scan:
-            add_flight(page, scan, flight, before[n] if before else None)
+        with showing("sheets") as progress:
+            with ScanView(folder, progress=progress) as scan:
+                make_products(scan)
+            with ScanView(folder, progress=progress) as scan:  # without what they were made from
+                add_flight(page, scan, flight, before[n] if before else None)
     (out / "index.html").write_text("\n".join(page.parts), encoding="utf-8")
     print(out / "index.html")
 
