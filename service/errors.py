@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import Any
 
 from service.redaction import without_credentials
@@ -18,10 +17,10 @@ class SkyreliefError(Exception):
 
     exit_code = 1
 
-    def __init__(self, text: str = "", report: Mapping[str, Any] = MappingProxyType({})) -> None:
+    def __init__(self, text: str = "", report: Mapping[str, Any] | None = None) -> None:
         """``report`` is what was done all the same, for --json."""
         super().__init__(without_credentials(text))
-        self.report = report
+        self.report = dict(report or {})  # failures come from other processes, pickled
 
 
 class InputError(SkyreliefError):

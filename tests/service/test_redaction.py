@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import pickle
 import subprocess
 import sys
 import urllib.request
@@ -81,6 +82,13 @@ def test_hostile_text_takes_no_long_time() -> None:
 
 def test_every_secret_key_is_a_key() -> None:
     assert {f"{section}.{field.name}" for section, field in keys()} >= SECRET_KEYS
+
+
+def test_a_failure_of_another_process_keeps_its_kind_text_and_report() -> None:
+    for error in (InputError("no flight"), OutsideError("not ready", {"ok": False})):
+        came = pickle.loads(pickle.dumps(error))
+        assert type(came) is type(error)
+        assert (str(came), came.report) == (str(error), error.report)
 
 
 class Source(CameraSource):
