@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import random
 import socket
 import threading
@@ -169,7 +170,7 @@ class LinkEmulator:
         """Carry one direction until its sender is done.
 
         After a cut, data for an end that has closed meanwhile is sent as one segment, because a
-        reset answers it.
+        reset answers it. No two calls have one time: the loop orders those as it likes.
         """
         latest = 0.0
         with contextlib.suppress(OSError):
@@ -181,12 +182,12 @@ class LinkEmulator:
                 out = pipe.send(len(data), now)
                 if late > 0 and _has_closed(writer):
                     break
-                latest = max(latest + 1e-9, out)  # a stream keeps its order
+                latest = max(math.nextafter(latest, math.inf), out)
                 self._loop.call_at(latest, writer.write, data)
                 excess = pipe.backlog_bytes(now) - QUEUE_BYTES
                 if excess > 0:
                     await asyncio.sleep(excess / (self._model.rate_kbit_s * 125))
-        self._loop.call_at(latest, writer.close)
+        self._loop.call_at(math.nextafter(latest, math.inf), writer.close)
 
 
 def _has_closed(writer: asyncio.StreamWriter) -> bool:

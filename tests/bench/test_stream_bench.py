@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
-from service.bench.link_emulator import LinkModel, Traffic, _Direction
+from service.bench import link_emulator
+from service.bench.link_emulator import LinkEmulator, LinkModel, Traffic, _Direction
 
 WIRE = 1400 + 52
 
@@ -32,6 +37,28 @@ def test_loss_has_its_share_and_stalls_a_stream() -> None:
     stream = _Direction(model, 0.0, 7)
     late = [k for k in range(5000) if stream.send(100, float(k)) - k > 0.25]
     assert 100 < len(late) < 200
+
+
+def test_a_stream_with_losses_keeps_its_order_and_its_last_bytes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    years_s = 1e8  # a machine that is up for so long has a coarse clock
+    monkeypatch.setattr(link_emulator, "time", SimpleNamespace(monotonic=lambda: years_s))
+    emulator = LinkEmulator(LinkModel(rate_kbit_s=1e6, delay_s=1.0, loss=0.5), 1, 2)
+    emulator._loop.close()
+    at_s: list[float] = []
+    plan = Mock(call_at=lambda at, *_: at_s.append(at))
+    monkeypatch.setattr(emulator, "_loop", plan)
+
+    async def relay() -> None:
+        reader = asyncio.StreamReader()
+        reader.feed_data(bytes(20 * 1400))
+        reader.feed_eof()
+        await emulator._relay(reader, Mock(), emulator._up)
+
+    asyncio.run(relay())
+    assert len(at_s) == 21  # the end comes after the last bytes
+    assert all(before < after for before, after in pairwise(at_s))
 
 
 def test_the_busiest_window_is_found() -> None:
