@@ -87,8 +87,10 @@ class MavlinkPlayer:
 
     def _send(self, message: Any, component: int) -> None:
         data = self._packer.pack(1, OutgoingMessage(component, message), 0)
+        if data is None:
+            return
         try:
-            self.socket.sendto(data or b"", self._to)
+            self.socket.sendto(data, self._to)
         except OSError as error:  # a full buffer or a refused datagram loses one packet
             log.debug("MAVLink packet not sent: %s", error)
 

@@ -200,7 +200,7 @@ def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     """The scan in ``folder``, brought into ``frame`` when it is georeferenced."""
     if not folder.is_dir():
         raise InputError(f"scan {folder}: no such folder")
-    summary = read_json(folder / "scan.json", dict[str, Any], MAX_JSON_BYTES, "scan.json")
+    summary = read_json(folder / "scan.json", dict[str, Any], MAX_JSON_BYTES, "summary of a scan")
     points, own_m, whole_m = _read_cloud(folder / "cloud.laz")
     if len(points) == 0:
         raise InputError(f"scan {folder}: cloud.laz contains no points; nothing to score")
