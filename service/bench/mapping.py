@@ -31,7 +31,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     source, target, T = pair(0, 0.0)
     guess = start(0, T)
     config = IcpConfig()
-    what = "align 57,600 points"
+    what = "align 57,600 points of a village"
     ours = partial(register_projective, source, target, guess, config)
     results = []
     for peer, other in peers().items():

@@ -18,7 +18,10 @@ def run(options: BenchOptions) -> list[BenchResult]:
 
     The second figure of registration has noise that neighbouring pixels share, as stereo has it.
     """
-    noises = ((0.0, "error, noise of each pixel"), (2.0, "error, noise of patches"))
+    noises = (
+        (0.0, "error in a village, noise of each pixel"),
+        (2.0, "error in a village, noise of patches"),
+    )
     aligned = [row for blur_px, words in noises for row in errors(words, blur_px, IcpConfig())]
     return [*aligned, *accuracy(), position_error()]
 
