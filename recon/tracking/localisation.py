@@ -82,10 +82,9 @@ heading."""
 class Localiser:
     """Poses of frames of one camera without distortion."""
 
-    def __init__(self, camera: Camera, features: FeatureCache, row_track: RowTrack) -> None:
-        """``features`` finds views that no motion predicts."""
+    def __init__(self, camera: Camera, row_track: RowTrack) -> None:
         self.camera, self._row_track = camera, row_track
-        self._features = features
+        self._features = FeatureCache()  # finds views that no motion predicts
         self._near_px = [share * camera.size_px[0] for share in FEATURE_SHARES]
         self._drift = np.eye(3)  # from the pixels of a segment's first frame to the last one's
 

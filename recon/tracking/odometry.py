@@ -40,7 +40,6 @@ from recon.tracking.localisation import (
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
-from recon.tracking.sift_features import FeatureCache
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
 MAX_TURN_RAD = 0.25
@@ -92,7 +91,6 @@ class Odometry:
         self._missed_frame: Frame | None = None  # the last still, where it is lost
         self._late: Frame | None = None  # it, once the next still has placed it
         self._model: ConstantVelocity | None = None
-        features = FeatureCache()
         self.exposure = ExposureWatch()
         self._row_track = RowTrack(lens or camera, seeks_readout)
         clock = self._row_track.clock
@@ -100,7 +98,7 @@ class Odometry:
         self.focal, self._watched_seq = FocalWatch(self.K), -1
         self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
-        self._localiser = Localiser(camera, features, self._row_track)
+        self._localiser = Localiser(camera, self._row_track)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
         self._depth = float("nan")  # median of the last keyframe's landmarks
 
@@ -264,7 +262,9 @@ class Odometry:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
         ok[matched[~view.inliers]] = False
-        scale = self._first_landmarks(view, matched[view.inliers], new.prior)
+        scale = prediction.metric_scale(view, first.prior, new.prior, first.T_odom_camera)
+        points = se3.transform(first.T_odom_camera, view.points[view.inliers] * scale)
+        first.landmark[matched[view.inliers]] = first.landmarks.add(points)
         self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
         return self._accept_two_views(new, (first, second @ first.T_camera_odom, uv, ok))
@@ -276,15 +276,6 @@ class Odometry:
         """
         off_px = float(self.K[0, 0]) * prediction.beyond_turn(uv_a, uv_b, self.K)
         return off_px > 2.0 * two_view.MAX_ERROR_PX
-
-    def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
-        """Enter the two-view points into the table; return metres per unit of the baseline."""
-        first = self.keyframes[0]
-        T_odom_a = first.T_odom_camera
-        scale = prediction.metric_scale(view, first.prior, prior, T_odom_a)
-        points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
-        first.landmark[rows] = first.landmarks.add(points)
-        return scale
 
     def _place_early(self, first: OdometryKeyframe) -> None:
         """Poses of the frames after the first; they say how its rows moved."""
