@@ -136,6 +136,7 @@ class ViewSelection:
 
     def offer(self, frame: Frame) -> bool:
         """True when the frame is to be a view."""
+        frame = replace(frame, image=NO_IMAGE)
         if self.takes_next or self._wants(frame):
             self.takes_next = False
             self._keep(frame)
@@ -159,7 +160,7 @@ class ViewSelection:
             frame is not None and not frame.is_blurred and _apart(frame, self._kept[-1]) >= least
         )
         if frame is not None and is_view:
-            self._keep(frame)
+            self._keep(replace(frame, image=NO_IMAGE))
         last = self._kept[-1]
         near = [v for v in self._recent if v.segment == last.segment and not v.is_blurred]
         near = [v for v in near if 0.5 * step <= _apart(v, last) < 0.9 * step]
@@ -205,7 +206,7 @@ class ViewSelection:
 
     def ready(self, view: Frame) -> bool:
         """True when the view has two neighbours to pair with, or its segment is over."""
-        if not self._kept or self._kept[-1] is view:
+        if not self._kept or self._kept[-1].seq == view.seq:
             return False
         if self._kept[-1].segment != view.segment:
             return True
@@ -233,7 +234,7 @@ class ViewSelection:
         """
         others = [
             v for v in [*self._kept, *self._between]
-            if v.segment == view.segment and not v.is_blurred and v is not view
+            if v.segment == view.segment and not v.is_blurred and v.seq != view.seq
         ]  # fmt: skip
         if not self._is_auto:
             others.sort(key=lambda v: (v.seq < view.seq, abs(v.seq - view.seq)))
@@ -245,7 +246,7 @@ class ViewSelection:
             good = [v for v in others if _apart(v, view) <= widest]
             return _evenly(good, KNOWN_PARTNERS * self.max_partners) or others[: self.max_partners]
         if not self._between:
-            extra = self._extra[1] if self._extra and self._extra[0] is view else []
+            extra = self._extra[1] if self._extra and self._extra[0].seq == view.seq else []
             return [*extra, *others[: self.max_partners]]
         # Between half and twice the keyframes' spacing, evenly spread.
         spacing = next((_apart(v, view) for v in others if v in self._kept), 0.0)
@@ -286,11 +287,10 @@ class VirtualStereoCamera:
         self._odometry, self._K, self._refused = odometry, undistorter.camera.K, refused
         self._segment = odometry.segment
         self._fixes = FixAverage()
-        self._waiting: deque[tuple[Frame, U8, PosePrior]] = deque()
+        self._waiting = deque[Frame]()
         self._given: deque[RelativePose] = deque(maxlen=8)
         self._first = -1  # number of the newest view that was given with its first partner
-        # The last tracked frame, unless it is a view, and its image.
-        self._latest: tuple[Frame, U8] | None = None
+        self._latest: Frame | None = None  # the last tracked frame, unless it is a view
         self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
 
     def take(self, tracked: Frame) -> bool:
@@ -300,37 +300,37 @@ class VirtualStereoCamera:
             self._segment = tracked.segment
         if tracked.T_tracked is None or tracked.relative is None:
             return False
-        frame = replace(tracked, image=NO_IMAGE, pyramid=(), mask=None)
+        frame = replace(tracked, pyramid=(), mask=None)
         self._tracked.append((frame.time_ns, tracked.relative))
         is_view = self.selection.offer(frame)
         self._fixes.take(tracked.T_tracked, frame.prior)
         if is_view:
-            self._wait(frame, tracked.image)
-        self._latest = None if is_view else (frame, tracked.image)
+            self._wait(frame)
+        self._latest = None if is_view else frame
         return is_view
 
     def end_stretch(self) -> None:
         """Make a view of a stretch's last frame: only it shows what the camera saw last."""
-        frame = None if self._latest is None else self._latest[0]
-        if self.selection.end_stretch(frame) and self._latest is not None:
-            self._wait(*self._latest)
+        if self.selection.end_stretch(self._latest) and self._latest is not None:
+            self._wait(self._latest)
         self._fixes.forget()
         self._latest = None
 
-    def _wait(self, view: Frame, image: U8) -> None:
+    def _wait(self, view: Frame) -> None:
         """Keep a view until its partners are there; all fixes since the last one are its own."""
-        self._waiting.append((view, image, self._fixes.given(view.T_odom_camera, view.prior)))
+        prior = self._fixes.given(view.T_odom_camera, view.prior)
+        self._waiting.append(replace(view, prior=prior))
 
     def ready(self, everything: bool = False) -> Iterator[StereoView]:
         """The views whose partners are there, in order."""
-        while self._waiting and (everything or self._is_ready(self._waiting[0][0])):
-            view, image, prior = self._waiting.popleft()
+        while self._waiting and (everything or self._is_ready(self._waiting[0])):
+            view = self._waiting.popleft()
             if not self.selection.confirmed(view):
                 self._refused[TWO_ONLY] += 1
             elif view.is_blurred:
                 self._refused["blurred"] += 1
             else:
-                found = self._stereo_view(view, image, prior, self.selection.partners(view))
+                found = self._stereo_view(view, self.selection.partners(view))
                 self._given.append(found.relative)
                 yield found
 
@@ -338,26 +338,20 @@ class VirtualStereoCamera:
         """The newest view with the first frame that shows its depth as the only partner; once."""
         if not self._waiting or self._latest is None:
             return None
-        (view, image, prior), (partner, _) = self._waiting[-1], self._latest
+        view, partner = self._waiting[-1], self._latest
         if view.seq == self._first or not self.selection.shows_first(partner, view):
             return None
         self._first = view.seq
-        return replace(self._stereo_view(view, image, prior, [partner]), is_first_depth=True)
+        return replace(self._stereo_view(view, [partner]), is_first_depth=True)
 
     def _is_ready(self, view: Frame) -> bool:
         """True when its partners are there, and the images could show the readout."""
-        search, newest = self._odometry.readout, self._waiting[-1][0].row_motion
+        search, newest = self._odometry.readout, self._waiting[-1].row_motion
         shows = search is not None and search.is_open and newest.is_measured
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
-    def _stereo_view(
-        self,
-        view: Frame,
-        image: U8,
-        prior: PosePrior,
-        partners: list[Frame],
-    ) -> StereoView:
-        """The view with its ``image``, which is without distortion from now on."""
+    def _stereo_view(self, view: Frame, partners: list[Frame]) -> StereoView:
+        """The view with its image, which is without distortion from now on."""
         relative, points = view.relative, landmark_points(view.keyframe)
         assert relative is not None
         points = se3.transform(se3.inverse(relative.T_keyframe_camera), points)
@@ -367,8 +361,8 @@ class VirtualStereoCamera:
         keys = [k for k in self._odometry.keyframes if since < k.seq <= view.keyframe.seq]
         return StereoView(
             view.time_ns,
-            prior,
-            replace(self._posed(view, in_odom), bgr=self._undistorter.image(image)),
+            view.prior,
+            replace(self._posed(view, in_odom), bgr=self._undistorter.image(view.image)),
             tuple(self._posed(partner, in_odom) for partner in partners),
             relative,
             points,
