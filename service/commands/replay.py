@@ -20,8 +20,10 @@ from service.progress import CancelledError, Progress
 from service.workers import PROCESS, Worker, end_processes
 
 if TYPE_CHECKING:
+    from mavlink.telemetry.logs import TelemetryLog
+    from recon.types import Camera
     from service.cameras.source import CameraSource
-    from service.commands.missing_metadata import Correction
+    from service.commands.missing_metadata import Correction, StartLens
     from service.config import Config
     from service.flight.scan import Scan, ScanInputs
 
@@ -65,13 +67,11 @@ def replay(
     one_pool()
     from service.cameras import open_camera, parse_source
     from service.cameras.camera_file import load_camera
-    from service.cameras.lens import check_width, fitted
     from service.cameras.source import Paced
     from service.commands.adjusted_stills import adjusted_stills
     from service.commands.missing_metadata import (
         load_log,
         own_telemetry,
-        start_lens,
         start_of,
         with_own_lens,
         with_stated_readout,
@@ -95,13 +95,7 @@ def replay(
     with closing(Paced(source) if realtime else source) as played:
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
-        notes: list[str] = []
-        if camera is not None:
-            start, (lens, notes) = None, fitted(camera, source)
-        else:
-            start = start_lens(source, log)
-            lens = start.camera
-        check_width(lens, source.description)
+        start, lens, notes = _lens(camera, source, log)
         lens, chosen = with_stated_readout(lens, chosen, video, source, notes)
         epoch_ns, unix_offset_ns, is_assumed = start_of(source, log, video_epoch, notes)
         start_s = (epoch_ns + unix_offset_ns) / 1e9
@@ -116,11 +110,10 @@ def replay(
             extra={"backend": opened.name, "source": source.description},
         )  # fmt: skip
         is_latency_given = is_given(LATENCY, config, overrides)
-        unsure: set[str] = set()  # what the images may correct: then the scan begins again
+        unsure: set[str] = set()
         if not realtime and parse_source(video)[0] == "file":
             is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)
-            is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
-            unsure = {"readout"} if is_of_camera or is_clock_given else {"readout", "clock"}
+            unsure = _unsure(log, is_clock_given)
         with nullcontext(Progress()) if as_json else showing("replay") as progress:
             if start is not None:
                 find = find_lens and not realtime
@@ -160,6 +153,29 @@ def denser(config: Config, source: CameraSource) -> Config:
     compute = config.compute
     width = min(STEREO_WIDTH_PX, source.size_px[0] // 2, compute.guide_width)
     return change(config, WIDTH, max(width, compute.stereo_width))
+
+
+def _lens(
+    camera: Camera | None, source: CameraSource, log: TelemetryLog | None
+) -> tuple[StartLens | None, Camera, list[str]]:
+    """Where the search for a lens starts, None with a camera model; the lens, and notes on it."""
+    from service.cameras.lens import check_width, fitted
+    from service.commands.missing_metadata import start_lens
+
+    notes: list[str] = []
+    if camera is not None:
+        start, (lens, notes) = None, fitted(camera, source)
+    else:
+        start = start_lens(source, log)
+        lens = start.camera
+    check_width(lens, source.description)
+    return start, lens, notes
+
+
+def _unsure(log: TelemetryLog | None, is_clock_given: bool) -> set[str]:
+    """What the images of a recording may correct: then its scan begins again."""
+    is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
+    return {"readout"} if is_of_camera or is_clock_given else {"readout", "clock"}
 
 
 def _corrected(
