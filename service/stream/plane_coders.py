@@ -187,6 +187,35 @@ def _guess(c: I64, k: I64, i: int, row: int, base: int, w: I64) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
+def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple[F64, F64]:
+    """Weighted sums of the fit over every ``step``-th pixel; smooth surroundings weigh more.
+
+    The sums are the lower triangle of a symmetric matrix.
+    """
+    h, w = size
+    row = w + 2 * MARGIN
+    A = np.zeros((9, 9))
+    b = np.zeros(9)
+    x = np.zeros(9)
+    for v in range(h):
+        for u in range((v * 7) % step, w, step):
+            i = (v + MARGIN) * row + u + MARGIN
+            if k[i] == 0 or k[i - 1] == 0:
+                continue
+            base = c[i - 1]
+            for j in range(9):
+                at = i + NEIGHBOURS[j + 1, 0] * row + NEIGHBOURS[j + 1, 1]
+                x[j] = (c[at] - base) * k[at]
+            unrest = 2.0 + abs(x[0]) + abs(x[1]) + abs(x[2]) + abs(x[3])
+            weight = 1.0 / (unrest * unrest)
+            for j in range(9):
+                b[j] += weight * x[j] * (c[i] - base)
+                for m in range(j + 1):
+                    A[j, m] += weight * x[j] * x[m]
+    return A, b
+
+
+@numba.njit(cache=True, nogil=True)
 def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
     """Zigzag residuals of the known pixels in scan order.
 
@@ -264,17 +293,11 @@ def _padded(plane: npt.NDArray[np.generic]) -> I64:
 
 def fit(c: I64, k: I64, size: tuple[int, int]) -> I64:
     """(9,) weights, 4096 is one, that predict the padded codes best; least squares about a
-    plane, in which smooth surroundings weigh more."""
-    row = size[1] + 2 * MARGIN
-    known = np.flatnonzero(k)
-    some = known[:: max(1, round(known.size / FIT_PIXELS))]
-    some = some[k[some - 1] > 0]
-    base = c[some - 1]
-    around = some[:, None] + NEIGHBOURS[1:] @ (row, 1)
-    x = ((c[around] - base[:, None]) * k[around]).astype(np.float64)
-    weighted = x / (2.0 + np.abs(x[:, :4]).sum(axis=1, keepdims=True)) ** 2
-    A = weighted.T @ x + _PRIOR * np.eye(WEIGHTS)
-    weights = np.linalg.solve(A, weighted.T @ (c[some] - base) + _PRIOR * _PLANE)
+    plane."""
+    step = max(1, round(k.sum() / FIT_PIXELS))
+    A, b = _normal_equations(c, k, size, step)
+    A += np.tril(A, -1).T + _PRIOR * np.eye(WEIGHTS)
+    weights = np.linalg.solve(A, b + _PRIOR * _PLANE)
     return np.asarray(np.rint(np.clip(weights, -7.9, 7.9) * (1 << SHIFT)), np.int64)
 
 
