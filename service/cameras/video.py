@@ -73,6 +73,7 @@ class VideoSource(CameraSource):
             self.close()
             raise InputError(f"{description}: its video has a format that cannot be decoded")
         self._stream = stream
+        self._images = stream.frames  # a closed container has freed its stream
         self._decoded = decoded_frames(
             container.demux(stream), self._stream, self._warn, self._damage, self._is_needed
         )
@@ -132,7 +133,7 @@ class VideoSource(CameraSource):
 
     @property
     def images(self) -> int:
-        return self._stream.frames
+        return self._images
 
     def only_near(self, times_ns: Iterable[int], within_ns: int) -> None:
         """Yield no other images than those near ``times_ns``, at least one, and end with the last.
