@@ -254,13 +254,21 @@ class DroneReceiver:
             self._rest(scan, str(error), now)
 
     def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
-        """Pause a scan that cannot be written; one whose folder was deleted begins again."""
+        """Pause a scan that cannot be written; missing items are requested later.
+
+        One whose database was deleted is forgotten: the drone's next head begins it again.
+        """
         if trouble != scan.trouble:
             log.error("%s; trying again every %.0f s", trouble, self._limits.full_disk_rest_s)
         scan.trouble, scan.rest_until = trouble, now + self._limits.full_disk_rest_s
-        if not os.path.isdir(scan.folder):
-            self._scans.pop(scan.name, None)
-            scan.intake.store.close()
+        if self._scans.get(scan.name) is scan:
+            try:
+                os.stat(scan.intake.store.path)
+            except FileNotFoundError:
+                del self._scans[scan.name]
+                scan.intake.store.close()
+            except OSError as error:  # the disk is away, the scan may still be there
+                log.debug("%s", error)
 
     def _introduce(self, name: str, payload: bytes, now: float) -> None:
         """Take in an item of a scan without a folder; a valid header makes the folder."""

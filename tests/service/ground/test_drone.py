@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import zlib
+from errno import EIO, ENOENT
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -181,6 +184,33 @@ def test_a_growing_scan_is_written_when_that_is_asked_for(tmp_path: Path) -> Non
     one.written()
     one.pass_time(1.0)
     assert one.writes == []  # it did not grow
+    one.close()
+
+
+@pytest.mark.parametrize(("error", "is_forgotten"), [(ENOENT, True), (EIO, False)])
+def test_a_scan_is_forgotten_when_it_was_deleted_not_when_its_disk_is_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, is_forgotten: bool
+) -> None:
+    usage = (1 << 40, 0, 1 << 40)
+    one = Onboard(tmp_path, DroneLimits(look_s=0.0, usage=lambda _: usage))
+    one.head()
+    one.answer()
+    (scan,) = one.ground.scans
+    hidden = str(scan.intake.store.path if is_forgotten else scan.folder)
+    stat = os.stat
+
+    def away(path: Any, **options: Any) -> os.stat_result:
+        if str(path).startswith(hidden):
+            raise OSError(error, os.strerror(error), str(path))
+        return stat(path, **options)
+
+    monkeypatch.setattr(os, "stat", away)
+    usage = (1 << 40, 1 << 40, 0)  # full
+    one.send("pose", one.store.add_pose(PoseRecord(1, np.eye(4), np.eye(6))))
+    assert one.ground.scans == ([] if is_forgotten else [scan])
+    monkeypatch.undo()
+    if not is_forgotten:
+        scan.intake.store.put_header(scan.intake.store.header)  # it is open
     one.close()
 
 
