@@ -16,6 +16,7 @@ import contextlib
 import itertools
 import logging
 import queue
+import resource
 import threading
 import time
 from collections import deque
@@ -33,7 +34,6 @@ from service.ground.front import behind_fronts
 from service.ground.live_site import run as run_live_site
 from service.ground.received import ReceivedScan, deliver, folders_due, write_files
 from service.ground.sites import Sites
-from service.listener import raise_descriptor_limit
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
@@ -360,8 +360,9 @@ class Receiver:
             worker.beat()
             came = one.take(TICK_S)
             began_s, now = time.thread_time(), time.monotonic()
-            descriptors = raise_descriptor_limit() // DESCRIPTOR_SHARE
-            room = descriptors // DESCRIPTORS_PER_SCAN // max(1, len(self._busy))
+            descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+            room = descriptors // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN
+            room //= max(1, len(self._busy))
             scans.max_open = max(2, min(self.limits.open_scans, room))
             for effect in scans.handle(*came, now):
                 self._perform(one, effect)
