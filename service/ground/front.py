@@ -38,7 +38,7 @@ ADMITTED = 2
 """Replies of Zenoh after which it has checked the other end: the second of TLS needs its
 certificate."""
 BLOCK_BYTES = 32_768
-LOOK_S = 0.1
+LOOK_S, CLOSE_S = 0.1, 5.0
 BACKLOG = 512
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -86,8 +86,11 @@ class Front:
 
     async def _serve(self, worker: Worker, listener: BoundedListener) -> None:
         async def accept(*outer: Any) -> None:
-            with contextlib.closing(outer[1]), contextlib.suppress(OSError):
-                await self._pass(listener, outer)
+            with contextlib.suppress(OSError, asyncio.TimeoutError):
+                with contextlib.closing(outer[1]):
+                    await self._pass(listener, outer)
+                await asyncio.wait_for(outer[1].wait_closed(), CLOSE_S)
+            outer[1].transport.abort()  # it does not take what is left
 
         server = await asyncio.start_server(
             accept, sock=listener, backlog=BACKLOG, limit=BLOCK_BYTES

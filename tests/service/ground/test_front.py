@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil  # type: ignore[import-untyped]
 import pytest
 from loopback import free_port, until
 
@@ -97,6 +98,27 @@ def test_few_of_one_address_are_in_their_handshake(front: tuple[Front, int]) -> 
         taken.pop(0).close()  # Zenoh refuses one
         until(lambda: come() == MAX_OF_ADDRESS + 1)
         until(lambda: sum(_is_ended(one) for one in calls) == 1)
+
+
+def test_who_takes_no_bytes_and_ends_keeps_no_connection(front: tuple[Front, int]) -> None:
+    address, _, port = front[0].inner.partition("/")[2].partition(":")
+    with (
+        socket.create_server((address, int(port))) as server,
+        socket.create_connection(("127.0.0.1", front[1]), timeout=20) as outer,
+    ):
+        outer.sendall(b"hello")
+        inner, _ = server.accept()
+        with inner:
+            for end, other in ((inner, outer), (outer, inner)):  # with the next it is admitted
+                end.sendall(b"reply")
+                assert other.recv(5)
+            inner.settimeout(1.0)
+            with contextlib.suppress(TimeoutError):
+                while True:  # until no buffer on the way has room
+                    inner.sendall(bytes(1 << 20))
+            outer.shutdown(socket.SHUT_WR)
+            peer, process = outer.getsockname(), psutil.Process()
+            until(lambda: peer not in [one.raddr for one in process.net_connections("tcp4")])
 
 
 def _is_ended(one: socket.socket) -> bool:
