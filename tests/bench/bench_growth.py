@@ -23,7 +23,7 @@ from recon.backends.cpu import CpuBackend
 from recon.types import F64, U8, Camera
 from service.bench import BenchOptions, BenchResult, in_process
 from service.bench.pipeline import SIZE, SPEED_M_S, K, resident_mib
-from service.cameras.source import CameraFrame, GeoTag
+from service.cameras.source import CameraFrame, CameraSource, GeoTag
 from service.config import load_config
 from service.flight.scan import Scan, ScanInputs, create_store
 from service.georeference import LocalFrame
@@ -108,18 +108,15 @@ def measure(keyframes: int) -> Flown:
         )
 
 
-class LongFlight:
+class LongFlight(CameraSource):
     """A camera over an endless plane, whose every block has a texture of its own."""
 
-    description = "parallel legs over a plane"
     size_px = SIZE
     epoch_unix_ns = EPOCH_NS
-    start_monotonic_ns = None
     fps = float(FPS)
-    is_live = False
 
     def __init__(self) -> None:
-        self.warnings: list[str] = []
+        super().__init__("parallel legs over a plane")
         self.own_s = 0.0  # processor time of making the images
 
     def __iter__(self) -> Iterator[CameraFrame]:
@@ -131,14 +128,13 @@ class LongFlight:
             tilt = 0.9 * tilt + rng.normal(0, 0.002, 3)
             centre = np.array([*place(SPEED_M_S * seq / FPS), HEIGHT_M])
             image = photograph(se3.compose(se3.so3_exp(tilt) @ np.diag([1.0, -1, -1]), centre))
-            (fix,) = HOME.to_geodetic(centre[None] + rng.normal(0, FIX_M, (1, 3))).tolist()
-            tag = GeoTag(*fix, FIX_M, FIX_M, is_sigma_h_stated=True)
+            lat, lon, alt = HOME.to_geodetic(centre[None] + rng.normal(0, FIX_M, (1, 3)))[
+                0
+            ].tolist()
+            tag = GeoTag(lat, lon, alt, FIX_M, FIX_M, is_sigma_h_stated=True)
             self.own_s += time.thread_time() - start
             yield CameraFrame(image, round(seq * 1e9 / FPS), seq, tag, f"frame {seq}")
             seq += 1
-
-    def close(self) -> None:
-        """There is nothing to release."""
 
 
 def place(way_m: float) -> tuple[float, float]:

@@ -20,7 +20,7 @@ def pose(east: float, north: float) -> F64:
 
 
 def test_the_way_has_no_gap_and_comes_to_new_ground() -> None:
-    places = np.array([place(way) for way in np.arange(0.0, 4 * (LEG_M + APART_M), 1.0)])
+    places = np.array([place(float(way)) for way in range(round(4 * (LEG_M + APART_M)))])
     assert np.linalg.norm(np.diff(places, axis=0), axis=1) == pytest.approx(1.0, abs=0.5)
     assert places[-1, 1] == pytest.approx(4 * APART_M, abs=1.0)
 
