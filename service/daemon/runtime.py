@@ -258,7 +258,7 @@ class Daemon:
         """Close scans that a crash or a power cut left open; then send what the ground lacks."""
         folder = Path(self.config.scan.folder)
         if self.scanning.claim.take(folder):
-            close_open_scans(folder, self.scanning.made)
+            close_open_scans(folder, self.scanning.made, lambda: not self._quit.is_set())
         else:
             log.warning("%s: another service uses it; earlier scans are left unchanged", folder)
         self.scanning.offer_backlog()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -422,3 +423,11 @@ def key_figures(summary: dict[str, Any]) -> list[str]:
     reasons = "; ".join(trust["reasons"])
     words = f"{trust['level']}: {reasons}" if reasons else trust["level"]
     return [f"{name}, {place}", ", ".join(figures), words]
+
+
+if __name__ == "__main__":
+    try:
+        with ScanStore.open(Path(sys.argv[1]) / "scan.db") as opened:
+            write_deliverables(Path(sys.argv[1]), opened, {})
+    except SkyreliefError as told:
+        sys.exit(str(told))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from service.errors import SkyreliefError
 from service.scans.writing import files_due
+from service.workers import python_command, run_to_end
 
 log = logging.getLogger(__name__)
 
@@ -21,34 +22,42 @@ PAGES = "map-pages"
 """Folder of the map inside a scan's folder; removed when the scan is closed."""
 
 
-def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
+def close_open_scans(
+    folder: Path, ours: Container[str], goes_on: Callable[[], bool] = lambda: True
+) -> list[str]:
     """Finish the scans in ``folder`` that a crash or a power cut left open; returns their names.
 
     Scans named in ``ours`` are in progress and left unchanged. The clock is not used, because a
     power cut may have reset it. The stored data is kept and the files are written, with
-    ``interrupted`` in the summary. An unreadable scan stays as it is, with a warning.
+    ``interrupted`` in the summary. An unreadable scan stays as it is, with a warning. Once
+    ``goes_on`` is False the rest waits for the next start.
     """
     from service.stream.store import ScanStore
 
     closed = []
     for path in sorted(folder.glob("*/scan.db")):
-        if path.parent.name in ours:
+        scan = path.parent
+        if scan.name in ours:
             continue
         try:
             with ScanStore.open(path) as store:
-                if store.finished and not files_due(path.parent):
+                if store.finished and not files_due(scan):
                     continue
-                shutil.rmtree(path.parent / PAGES, ignore_errors=True)
+                shutil.rmtree(scan / PAGES, ignore_errors=True)
                 if not store.finished:
                     store.finish({"interrupted": True})
-                from service.scans.folder import write_deliverables  # heavy, and seldom needed
-
-                write_deliverables(path.parent, store, {})
+            # A process of its own: its compiler and clouds would stay with an idle service.
+            write = python_command("service.scans.folder", str(scan))
+            fault = run_to_end("recover", write, lambda _: goes_on())
         except (SkyreliefError, ValueError, OSError, sqlite3.Error) as error:
-            log.warning("%s cannot be closed: %s", path.parent, error)
+            fault = str(error)
+        if not goes_on():
+            break
+        if fault:
+            log.warning("%s cannot be closed: %s", scan, fault)
             continue
-        closed.append(path.parent.name)
-        log.info("%s was left open; it is now closed", path.parent)
+        closed.append(scan.name)
+        log.info("%s was left open; it is now closed", scan)
     return closed
 
 

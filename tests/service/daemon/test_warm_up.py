@@ -67,7 +67,8 @@ until(lambda: daemon.actions.is_ready, 120)
 daemon.recover()
 import service.stream.link, service.stream.reports  # of scans that the ground lacks
 daemon.snapshot()
-print(*sorted({"numba", "llvmlite", "scipy", "torch"} & sys.modules.keys()))
+heavy = "av llvmlite numba pyproj recon.pipeline scipy service.flight.scan torch"
+print(*sorted({*heavy.split()} & sys.modules.keys()))
 daemon.scanning.is_warm = True
 until(hear_armed, 120)
 print(*sorted({"numba", "service.flight.scan"} & sys.modules.keys()))
@@ -82,6 +83,8 @@ def test_an_idle_service_holds_no_compiler_and_an_armed_one_is_prepared(tmp_path
     with ScanStore.create(scan / "scan.db", ScanHeader("1", "drone", 1)) as store:
         store.finish({})
     (scan / SUMMARY).write_text("{}")
+    cut_off = scan.with_name("20260102T000000Z")
+    ScanStore.create(cut_off / "scan.db", ScanHeader("2", "drone", 1)).close()
     settings = [
         f"camera.source={tmp_path}", f"camera.model={MODEL}", f"scan.folder={scan.parent}",
         "health.http=", "mavlink.links=[]", "mavlink.system_id=1", "compute.backend=cpu",
@@ -91,6 +94,7 @@ def test_an_idle_service_holds_no_compiler_and_an_armed_one_is_prepared(tmp_path
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (0, "\nnumba service.flight.scan\n"), done.stderr
+    assert (cut_off / "cloud.laz").is_file()
 
 
 def test_kernels_that_cannot_be_loaded_leave_the_rest_of_housekeeping(
