@@ -135,30 +135,35 @@ def boresight(
     if not stretches:
         return Constants()
     R_odom, R_reported, sigma = (np.concatenate(c) for c in zip(*stretches, strict=True))
-    of = np.repeat(np.arange(len(stretches)), [len(R) for R, *_ in stretches])
+    counts = [len(R) for R, *_ in stretches]
+    of, first = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts[:-1]])
     share = min(1.0, (1.0 + span_s / (2.0 * max(bias_tau_s, 1e-3))) / len(of))
-    each = R_reported @ R_odom.transpose(0, 2, 1)
-    frames = np.array([se3.nearest_rotation(each[of == k].sum(axis=0)) for k in range(of[-1] + 1)])
+    each = np.add.reduceat(R_reported @ R_odom.transpose(0, 2, 1), first)
+    frames = np.array([se3.nearest_rotation(mean) for mean in each])
     turn, known = np.zeros(3), np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
-    prior = np.r_[np.full(3, SIGMA_RAD**-2.0), np.full(3 * len(frames), 1e-9)]
-    of_frames = np.kron(np.eye(len(frames))[of], np.eye(3)).reshape(len(of), 3, -1)
     for _ in range(ROUNDS):
         Q = R_reported @ se3.so3_exp(turn)
         r = se3.each_so3_log(frames[of] @ R_odom @ Q.transpose(0, 2, 1))
         norms = np.sqrt(np.sum(known * r**2, axis=1))
         info = share * known * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))[:, None]
-        J = np.concatenate([-Q, of_frames], axis=2).reshape(-1, len(prior))
-        W = J * info.reshape(-1, 1)
-        H = W.T @ J + np.diag(prior)
-        step = np.linalg.solve(H, -W.T @ r.ravel() - prior * np.pad(turn, (0, 3 * len(frames))))
-        frames = se3.each_so3_exp(step[3:].reshape(-1, 3)) @ frames
-        turn = turn + step[:3]
+        # r + w - Q b, with the turns w of the frames eliminated, each by its own 3 x 3 block: a
+        # flight may come in hundreds of stretches.
+        A_ww, g_w = np.add.reduceat(info, first) + 1e-9, -np.add.reduceat(info * r, first)
+        A_wb = -np.add.reduceat(info[:, :, None] * Q, first)
+        gain = A_wb.transpose(0, 2, 1) / A_ww[:, None]
+        H = np.eye(3) / SIGMA_RAD**2 + np.einsum("nki,nk,nkj->ij", Q, info, Q)
+        H = H - np.sum(gain @ A_wb, axis=0)
+        g = np.einsum("nki,nk->i", Q, info * r) - np.einsum("fij,fj->i", gain, g_w)
+        step = np.linalg.solve(H, g - turn / SIGMA_RAD**2)
+        w = (g_w - A_wb @ step) / A_ww
+        frames = se3.each_so3_exp(w) @ frames
+        turn = turn + step
         turn *= min(1.0, BOUND_RAD / max(float(np.linalg.norm(turn)), 1e-12))
-        if np.abs(step).max() < 1e-6:
+        if max(np.abs(step).max(), np.abs(w).max()) < 1e-6:
             break
     if float(np.median(norms)) > WILD:
         return Constants()
-    return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))[:3]))
+    return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))))
 
 
 MIN_INTERVALS = 3

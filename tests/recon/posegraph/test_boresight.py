@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -55,6 +57,22 @@ def test_stretches_of_their_own_frames_count_together() -> None:
     assert not boresight(alone, 300.0).is_turn_sure
     both = boresight([*alone, flown(turn, [0.0, np.pi], 8)], 300.0)
     assert np.degrees(np.abs(both.turn - turn)[:2]).max() < 0.3
+
+
+def test_a_flight_in_hundreds_of_pieces_takes_little_memory() -> None:
+    rng = np.random.default_rng(3)
+    R_odom = se3.each_so3_exp(rng.normal(size=(10, 3)))
+    pieces = [
+        (R_odom, se3.so3_exp(rng.normal(size=3)) @ R_odom, np.full((10, 3), 0.02))
+        for _ in range(300)
+    ]
+    tracemalloc.start()
+    try:
+        boresight(pieces, 3000.0)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 20 * sum(array.nbytes for piece in pieces for array in piece)
 
 
 def test_noise_is_no_boresight_and_a_wrong_frame_neither() -> None:
