@@ -42,8 +42,8 @@ def umeyama(
 ) -> Similarity | None:
     """The similarity that best takes ``source`` (N, 3) to ``target``, by relative ``weight`` (N,).
 
-    ``is_level`` turns about z alone. None for fewer than three points or points in a line, which
-    leave a turn open. Umeyama 1991, doi:10.1109/34.88573.
+    ``is_level`` turns about z alone. Otherwise None for fewer than three points, points in a line
+    and points in one place, which leave a turn open. Umeyama 1991, doi:10.1109/34.88573.
     """
     w = np.ones(len(source)) if weight is None else weight
     w = w / w.sum()
@@ -55,7 +55,7 @@ def umeyama(
         R = se3.so3_exp(np.array([0.0, 0.0, yaw]))
     else:
         spread = np.linalg.svd(a, compute_uv=False)
-        if len(source) < 3 or spread[1] < 0.05 * spread[0]:
+        if len(source) < 3 or spread[1] <= 0.05 * spread[0]:
             return None
         R = se3.nearest_rotation(cross)
     scale = float(np.sum(R * cross)) / max(float(w @ np.sum(a**2, axis=1)), 1e-12)

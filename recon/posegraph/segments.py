@@ -120,7 +120,9 @@ class Segments:
         self._bias_tau_s = config.fix_s, config.attitude_s
 
     def __getitem__(self, number: int) -> Segment:
-        return self._all.setdefault(number, Segment(number))
+        if number not in self._all:
+            self._all[number] = Segment(number)
+        return self._all[number]
 
     def __iter__(self) -> Iterator[Segment]:
         """Those that have nodes, in order."""

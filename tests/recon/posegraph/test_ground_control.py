@@ -220,7 +220,8 @@ def test_a_similarity_from_three_points_or_none() -> None:
     assert np.allclose(found.t, [100.0, 20.0, -4.0])
     line = np.arange(4.0)[:, None] * np.array([1.0, 2.0, 0.1])
     assert umeyama(line, line) is None
-    assert umeyama(a[:2], b[:2]) is None
+    assert umeyama(a[:2], b[:2]) is None and umeyama(a[:0], b[:0]) is None
+    assert umeyama(np.ones((4, 3)), b) is None
 
 
 def test_wrong_shapes_are_refused() -> None:
