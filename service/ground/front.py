@@ -3,7 +3,8 @@
 Zenoh accepts nothing for 0.1 s after each TLS handshake that failed, or did not come within 10 s: a
 thousand idle connections of one address would keep drones out for minutes. Here a connection
 reaches Zenoh with its first bytes, and few of one address are in their handshake at a time. The
-bytes pass unread, so certificates and access rights stay between the drone and Zenoh.
+bytes pass unread, so certificates and access rights stay between the drone and Zenoh. A proxy of
+the system would limit addresses, but not by Zenoh's handshakes.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ COMPRESSED = [Middleware(GZipMiddleware, compresslevel=5)]
 again."""
 
 MAX_LIVE_VIEWS = {False: 8, True: 16}
-"""Without a token, and with one."""
+"""Without a token, and with one. uvicorn's limit is one for all requests together."""
 ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
 """Rate limit of orders to the vehicle; a stop always passes."""
 

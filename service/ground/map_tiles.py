@@ -1,7 +1,8 @@
 """Maps of a scan over HTTP: XYZ tiles in Web Mercator, TileJSON, WMTS, KML.
 
 A layer comes from the exported raster where that is newer than the scan's other files, else from
-the keyframes as they arrive.
+the keyframes as they arrive. The documents are templates: tile servers (TiTiler, MapProxy) write
+them for rasters, not for a map that grows.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ BOUNDS = ("west", "south", "east", "north")
 KML_TILES = 4
 THUMBNAIL_PX = 480  # of its longer side, at most
 REFRESH_S = 2
-FRESH = {"cache-control": "max-age=1"}
+FRESH = {"cache-control": "max-age=1"}  # an ETag needs the tile drawn first
 NOW = {"cache-control": "no-cache"}
 """Whoever asks for the version of a map wants that of now."""
 

@@ -82,7 +82,7 @@ def _maps(request: Request) -> Response:
     if not is_regular(folder / MANIFEST):
         raise InputError(f"no maps yet; make {MAPS_KIND!r} first")
     name = f"{request.path_params['scan']}-maps.zip"
-    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    headers = {"content-disposition": f'attachment; filename="{name}"'}  # FileResponse's alone
     return StreamingResponse(zip_parts(folder), media_type="application/zip", headers=headers)
 
 

@@ -1,9 +1,10 @@
 """A scan that a browser uploads: a ZIP of its folder, its ``scan.db``, an MCAP, or a recording.
 
 The files stream to a folder of their own in the store, which is gone afterwards; the scan takes its
-place in one step. A recording (a video, its flight log, and perhaps its camera model) is replayed
-by a process of its own. Of an archive only the names of a scan's files are unpacked, wherever they
-lie in it, so that no path in it is ever used.
+place in one step. They are not a form: Starlette would first collect its parts in the system's
+temporary folder, which may have no room for 16 GiB. A recording (a video, its flight log, and
+perhaps its camera model) is replayed by a process of its own. Of an archive only the names of a
+scan's files are unpacked, wherever they lie in it, so that no path in it is ever used.
 """
 
 from __future__ import annotations
