@@ -84,11 +84,12 @@ def _say(step: int, what: str) -> None:
 def compile_kernels() -> None:
     """Compile the kernels of stereo, ICP and the codec, or load them from numba's cache."""
     from recon.backends.cpu import warm_up
-    from service.bench.keyframes import make_keyframe
+    from service.bench.keyframes import make_keyframe, strip
     from service.stream.codec import decode, encode
 
     warm_up()
-    decode(encode(make_keyframe(size_px=(160, 90)), 0))
+    size_px = 160, 90
+    decode(encode(make_keyframe(size_px=size_px, fresh=strip(size_px)), 0))
 
 
 def compile_meanwhile() -> list[subprocess.Popen[bytes]]:

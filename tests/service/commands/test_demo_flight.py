@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from loopback import until
@@ -11,6 +12,7 @@ from loopback import until
 import service
 from service.commands import demo
 from service.errors import InputError
+from service.stream import plane_coders, plane_kernels
 
 
 def make_flight(home: Path) -> Path:
@@ -30,6 +32,18 @@ def test_an_installed_wheel_brings_the_flight(tmp_path: Path) -> None:
     assert demo.demo_flight(None, homes) == brought
     clone = make_flight(homes[0])
     assert demo.demo_flight(None, homes) == clone
+
+
+def test_kernels_of_partly_new_keyframes_are_compiled_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recon.backends.cpu.warm_up", lambda: None)
+    kernels = {}
+    for module, name in (
+        (plane_coders, "_encode_bits"), (plane_coders, "_decode_bits"), (plane_kernels, "calm"),
+    ):  # fmt: skip
+        kernels[name] = Mock(wraps=getattr(module, name))
+        monkeypatch.setattr(module, name, kernels[name])
+    demo.compile_kernels()
+    assert [name for name, kernel in kernels.items() if not kernel.called] == []
 
 
 def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
