@@ -116,7 +116,7 @@ def _down(q: Quaternion) -> tuple[float, float, float]:
 
 SAME_RAD = math.radians(0.3)
 CLEAR_RAD = math.radians(0.05)
-MIN_TURNS, KEPT = 20, 120
+MIN_TURNS = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def frame_by_images(
     as every other frame with a different meaning.
     """
     shift = round(latency_ms * 1e6)
-    claims = [(claimed_at(a - shift), claimed_at(b - shift), seen) for a, b, seen in turns[-KEPT:]]
+    claims = [(claimed_at(a - shift), claimed_at(b - shift), seen) for a, b, seen in turns]
     known = [(a, b, seen) for a, b, seen in claims if a is not None and b is not None]
     if len(known) < MIN_TURNS:
         return None

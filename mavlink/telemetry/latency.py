@@ -29,6 +29,7 @@ RIVAL = 1.3  # a second solution, further away than RIVAL_APART_S, must fit wors
 RIVAL_APART_S = 0.15
 KEPT = 2000
 LONG_NS = 1_000_000_000  # a turn over a shorter time is mostly noise
+LONG_KEPT = 120
 REACH_S = 5.0  # latencies that are sought, either way: a range without the true one holds aliases
 COARSE_S, FINE_S, FINE_STEPS = 0.04, 0.004, 8
 MIN_SHARE = 0.5  # of the most windows that telemetry covers at any latency
@@ -77,6 +78,10 @@ class LatencyWatch:
     def __init__(self) -> None:
         self._frames: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)  # run, time, turned
         self._run = 0
+        self._start: tuple[int, int, Quaternion]  # of the next long turn
+        self.long_turns: deque[tuple[int, int, Quaternion]] = deque(maxlen=LONG_KEPT)
+        """Rotations over a second or a little more, one after the other: the stamps of the first
+        and the second frame, and ``q_camera(first)_camera(second)``."""
 
     def add(self, first_ns: int, second_ns: int, q_step: Quaternion) -> None:
         """Add ``q_camera(first)_camera(second)`` between two frames, at their stamps.
@@ -88,21 +93,15 @@ class LatencyWatch:
             return
         if not self._frames or self._frames[-1][1] != first_ns:
             self._run += 1
-            self._frames.append((self._run, first_ns, (1.0, 0.0, 0.0, 0.0)))
+            self._start = (self._run, first_ns, (1.0, 0.0, 0.0, 0.0))
+            self._frames.append(self._start)
         turned = multiply(self._frames[-1][2], step)
         self._frames.append((self._run, second_ns, normalised(turned) or turned))
-
-    def long_turns(self) -> list[tuple[int, int, Quaternion]]:
-        """Rotations over a second or a little more, one after the other: the stamps of the first
-        and the second frame, and ``q_camera(first)_camera(second)``."""
-        found, start = [], None
-        for frame in self._frames:
-            if start is None or frame[0] != start[0]:
-                start = frame
-            elif frame[1] - start[1] >= LONG_NS:
-                found.append((start[1], frame[1], multiply(conjugate(start[2]), frame[2])))
-                start = frame
-        return found
+        _, start_ns, q_start = self._start
+        if second_ns - start_ns >= LONG_NS:
+            long = multiply(conjugate(q_start), self._frames[-1][2])
+            self.long_turns.append((start_ns, second_ns, long))
+            self._start = self._frames[-1]
 
     def since_ns(self, frames: int) -> int | None:
         """The stamp of the oldest of the newest ``frames``; None without any."""

@@ -168,7 +168,7 @@ class TelemetryCheck:
         if not self._fixed:
             settled = self.latency is not None and self.latency.is_settled
             latency = self.latency.latency_ms if settled and self.latency else self.applied_ms
-            seen = frame_by_images(self._turns.long_turns(), history.claimed_at, latency)
+            seen = frame_by_images(self._turns.long_turns, history.claimed_at, latency)
             self.frame = seen or self.frame
             self._judge_frame(history)
 

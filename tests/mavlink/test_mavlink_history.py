@@ -472,13 +472,12 @@ def test_the_images_decide_between_frames() -> None:
         history.add(claimed, T0 + k * 100 * MS)
     for k in range(259):
         if k == 150:
-            assert (
-                frame_by_images(watch.long_turns(), history.claimed_at) is None
-            )  # too few turns of a second
+            # Too few turns of a second.
+            assert frame_by_images(watch.long_turns, history.claimed_at) is None
         step = of_scipy(heads[k].inv() * heads[k + 1] * noise[k])
         # The camera's stamps are 30 ms late.
         watch.add(T0 + (100 * k + 30) * MS, T0 + (100 * k + 130) * MS, step)
-    verdict = frame_by_images(watch.long_turns(), history.claimed_at, 30.0)
+    verdict = frame_by_images(watch.long_turns, history.claimed_at, 30.0)
     assert verdict is not None and verdict.decided
     assert verdict.frame in (GimbalFrame.BODY, GimbalFrame.SERVO)
     assert set(verdict.refuted) == {GimbalFrame.EARTH, GimbalFrame.VEHICLE}

@@ -75,6 +75,20 @@ def test_the_latency_is_found(latency_s: float, camera_hz: float, telemetry_hz: 
     assert abs(found.latency_ms - 1e3 * latency_s) < 4.0 * found.sigma_ms
 
 
+@pytest.mark.parametrize("hz", [2, 10, 50])
+def test_the_long_turns_are_those_of_two_minutes_at_any_rate(hz: int) -> None:
+    watch, period_ns = LatencyWatch(), S // hz
+    for k in range(130 * hz):
+        gap_ns = S if k >= 65 * hz else 0  # between two runs
+        step = quaternion.from_rpy(0.0, 0.0, 0.1 / hz)  # 0.1 rad/s
+        watch.add(k * period_ns + gap_ns, (k + 1) * period_ns + gap_ns, step)
+    assert len(watch.long_turns) == 120
+    assert watch.long_turns[0][0] == 10 * S and watch.long_turns[-1][1] == 131 * S
+    for start_ns, end_ns, turn in watch.long_turns:
+        assert end_ns - start_ns == S
+        assert turn == pytest.approx(quaternion.from_rpy(0.0, 0.0, 0.1), abs=1e-12)
+
+
 def test_a_recording_is_found_anywhere_in_its_log() -> None:
     recording = watch_flight(100.0, 5e-4, 1.0, 15.0, seconds=35.0)
     assert recording.estimate(attitudes(20.0, noise_rad=1e-3)) is None
