@@ -28,6 +28,9 @@ MIN_POINTS = 30
 MAX_THICKNESS = 0.2
 """Spread across a plane over its width; thicker ground has no normal."""
 
+FAR = 3.0
+"""Times the median distance from the middle; landmarks beyond are placed badly, and tilt a plane by
+their long lever."""
 
 ROUNDS = 8
 """Fits of a plane, each with the weights of the one before."""
@@ -56,6 +59,9 @@ def levelled(prior: PosePrior, points: F64) -> PosePrior:
 def plane_normal(points: F64) -> F64 | None:
     """(3,) unit normal, towards the origin, of the plane through points (N, 3); None for too few,
     or where they lie on no plane."""
+    if len(points) >= MIN_POINTS:
+        far = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        points = points[far <= FAR * np.median(far)]
     if len(points) < MIN_POINTS:
         return None
     normal, size = plane_through(points)

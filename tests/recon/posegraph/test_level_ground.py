@@ -58,6 +58,15 @@ def test_a_view_far_from_the_assumed_one_is_levelled_by_its_ground(pitch_deg: fl
     assert np.linalg.norm(se3.so3_log(prior.R_world_camera.T @ truth)) > 0.1  # not the heading
 
 
+def test_a_few_landmarks_placed_far_off_change_no_tilt() -> None:
+    truth = looking(-40)
+    points = ground_seen(truth)
+    points[3::20] *= np.geomspace(3.0, 100.0, len(points[3::20]))[:, None]
+    prior = levelled(NADIR, points)
+    assert prior.R_world_camera is not None
+    assert np.degrees(np.arccos(prior.R_world_camera[2] @ truth[2])) < 2.0
+
+
 def test_a_known_attitude_and_a_slope_below_the_camera_stay() -> None:
     steep = ground_seen(looking(-40))
     known = replace(NADIR, sigma_tilt_rad=0.02, is_view_assumed=False)
