@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import re
+from typing import get_args
 
 from paths import ROOT
 
 from service.daemon.scan_state import TRANSITIONS
+from service.ground import drone
 from service.workers import ROWS
 
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -33,6 +35,14 @@ def test_the_table_of_a_scan_s_states_is_the_code_s() -> None:
         events = ", ".join(f"{event.value} > {after.text}" for event, after in row.items())
         table.append(f"| {state.text} | {state.phase.value} | {events} |")
     assert "\n".join(["", *table, ""]) in TEXT
+
+
+def test_the_events_and_effects_of_a_drone_are_the_code_s() -> None:
+    events, effects = (
+        ", ".join(kind.__name__ for kind in get_args(kinds))
+        for kinds in (drone.Event, drone.Effect)
+    )
+    assert f"events   {events}\neffects  {effects}\n" in TEXT
 
 
 def test_every_path_in_it_exists() -> None:
