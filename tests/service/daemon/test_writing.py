@@ -41,6 +41,10 @@ class Landing:
         self.store = ScanStore.create(folder / "s" / "scan.db", header)
         self.runs: list[ScanRun] = []
         self.daemon = Onboard(folder, script=self._script, write=files)
+        self.ended: list[dict[str, bool]] = []  # how its sender was ended
+        self.daemon.scanning.link.end_scan = (  # type: ignore[method-assign]
+            lambda _, **how: self.ended.append(how)
+        )
         self.daemon.scanning.start()
         until(lambda: self.runs)
 
@@ -87,6 +91,7 @@ def test_the_files_are_waited_for(slow: Slow, landing: Landing) -> None:
     slow.may_end.set()
     until(lambda: scanning.run is None)
     assert slow.written == ["s"]
+    assert landing.ended == [{"is_last": False}]
     assert isinstance(work.answer, Answer) and work.answer.result is Result.ACCEPTED
     assert scanning.phase is Phase.IDLE and not landing.is_open
     until(lambda: not scanning.in_the_making)
@@ -111,6 +116,7 @@ def test_another_scan_does_not_wait_for_them(slow: Slow, landing: Landing) -> No
     scanning.start()
     until(lambda: len(landing.runs) == 2)
     assert landing.is_open and work.answer is None
+    assert landing.ended == [{"is_next_wanted": True}]
     assert scanning.in_the_making == {"s"}
     slow.may_end.set()
     until(lambda: work.answer)
