@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import struct
 import subprocess
 import threading
 import time
@@ -16,6 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[impo
 from trial_rig import Service, stream_to
 
 ARMED, CUSTOM = 128, 1
+COMPANION = 191
+TIMESTAMPS = 35  # SO_TIMESTAMPNS
 
 
 class Autopilot(threading.Thread):
@@ -29,6 +32,9 @@ class Autopilot(threading.Thread):
         self.boot_s = time.monotonic() - 1000.0
         self.texts: list[str] = []  # STATUSTEXT that came back
         self.asked: list[Any] = []  # messages to send once
+        self.beats_s: list[
+            float
+        ] = []  # when the companion's heartbeats came, by the kernel's clock
 
     def run(self) -> None:
         """Send until :attr:`ended`."""
@@ -36,6 +42,7 @@ class Autopilot(threading.Thread):
         link.robust_parsing = True
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
             port.setblocking(False)
+            port.setsockopt(socket.SOL_SOCKET, TIMESTAMPS, 1)
             while not self.ended.wait(0.1):
                 if not self.silent.is_set():
                     for message in self._due():
@@ -58,9 +65,13 @@ class Autopilot(threading.Thread):
     def _hear(self, port: socket.socket, link: Any) -> None:
         with contextlib.suppress(OSError):
             while True:
-                for message in link.parse_buffer(port.recv(4096)) or []:
+                data, ((_, _, stamp), *_), _, _ = port.recvmsg(4096, 64)
+                for message in link.parse_buffer(data) or []:
                     if message.get_type() == "STATUSTEXT":
                         self.texts.append(message.text)
+                    if (message.get_type(), message.get_srcComponent()) == ("HEARTBEAT", COMPANION):
+                        seconds, nanoseconds = struct.unpack("@qq", stamp)
+                        self.beats_s.append(seconds + 1e-9 * nanoseconds)
 
 
 @contextlib.contextmanager

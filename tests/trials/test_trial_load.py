@@ -10,6 +10,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,8 @@ from service.daemon.machine import read_machine
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(1800 if WHOLE else 280)]
 
 STREAMED = "640:480", f"-framerate 8 -pattern_type glob -i {demo_stretch()}/*.jpg"
+BEAT_S = 1.2 if WHOLE else 3.0
+"""Between two heartbeats, at most."""
 MAX_HOGS = 64
 """Per core, before it is said that nothing makes the service late."""
 
@@ -131,6 +134,30 @@ def test_a_camera_is_there_again_after_landing_under_load(tmp_path: Path, record
     )
     assert acknowledged and not lost
     assert longest_s < BACK_S
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_heartbeats_keep_time_while_a_scan_and_others_take_the_cores(
+    tmp_path: Path, record: Row
+) -> None:
+    others = 4 * (os.cpu_count() or 1)
+    with aircraft(tmp_path, STREAMED, small_model(tmp_path, 640)) as (service, autopilot, _):
+        service.until(lambda: service.frames > 5, "frames")
+        with hogs(others):
+            began = len(autopilot.beats_s)
+            time.sleep(60.0 if WHOLE else 12.0)
+            beats_s = autopilot.beats_s[began:]
+        assert service.stop() == 0
+    longest_s = max(b - a for a, b in pairwise(beats_s))
+    record(
+        f"heartbeats while {others} processes take the cores from a scan",
+        len(beats_s),
+        f"longest gap {longest_s:.2f} s",
+        "-",
+        0.0,
+    )
+    assert len(beats_s) > (50 if WHOLE else 8)
+    assert longest_s < BEAT_S
 
 
 def test_memory_short_is_relieved(tmp_path: Path, record: Row) -> None:
