@@ -155,9 +155,14 @@ class Presence:
             state = self._state(now_ns)
             if state is None:
                 return []
-            make, rest = dialect.MAVLink_heartbeat_message, (0, self._token, int(state), 3)
             return [
-                OutgoingMessage(c, make(kind, NO_AUTOPILOT, *rest)) for c, kind in TYPES.items()
+                OutgoingMessage(
+                    component,
+                    dialect.MAVLink_heartbeat_message(
+                        kind, NO_AUTOPILOT, 0, self._token, int(state), 3
+                    ),
+                )
+                for component, kind in TYPES.items()
             ]
 
     # The autopilot.

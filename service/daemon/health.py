@@ -65,7 +65,8 @@ def _is_own(header: str | None, is_local: bool) -> bool:
     if is_local or is_loopback(name):
         return is_loopback(name)
     with contextlib.suppress(ValueError):
-        return bool(ipaddress.ip_address(name))
+        ipaddress.ip_address(name)
+        return True
     return name.partition(".")[0] == socket.gethostname().partition(".")[0].lower()
 
 
