@@ -124,7 +124,8 @@ class Odometry:
     def track(self, frame: Frame) -> list[Frame]:
         """The new frame with its pose, or why there is none; before it the last still, lost until
         now, where both together start a segment."""
-        found, late, self._late = self._track(frame), self._late, None
+        found = self._track(frame)
+        late, self._late = self._late, None
         return [found] if late is None else [late, found]
 
     def _track(self, frame: Frame) -> Frame:
