@@ -30,8 +30,6 @@ SEARCH_SHARE = 0.12
 MIN_MATCHES, MIN_INLIERS, MIN_INLIER_SHARE = 40, 30, 0.5
 """Corners found again, and those of them that the pose explains, and their share."""
 
-MATCHING = matching.MatchingConfig()
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopEnd:
@@ -117,14 +115,14 @@ def verify(a: LoopEnd, b: LoopEnd, T_a_b_guess: F64) -> LoopClosure | None:
     ``T_a_b_guess`` (4, 4) is the pose graph's estimate. Where it is too far off, the features that
     both images share predict instead.
     """
-    uv, points = landmarks(a, MATCHING)
+    uv, points = landmarks(a, matching.DEFAULT)
     if len(uv) < MIN_MATCHES:
         return None
     pyramids = [matching.build_pyramid(v.gray) for v in (a, b)]
     T_b_a = se3.inverse(T_a_b_guess)
     for predicted, warp, prior, share in _predictions(a, b, T_b_a, uv, points):
         radius = share * b.gray.shape[1]
-        found = matching.match(pyramids[0], uv, pyramids[1], predicted, radius, warp, MATCHING)
+        found = matching.match(pyramids[0], uv, pyramids[1], predicted, radius, warp)
         if np.count_nonzero(found.ok) < MIN_MATCHES:
             continue
         seen = found.uv_px[found.ok].astype(np.float64)
