@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -37,19 +37,18 @@ panel about this large."""
 PAINTED_ROWS = 128
 
 
-def draw_preview(
-    raster: Raster,
-    track_m: F64,
-    lines: Sequence[str],
-    largest_px: int = 1400,
-    height_of_zero_m: float = 0.0,
-) -> U8:
-    """(h, w, 3) BGR image of ``raster`` with the (N, 2 or 3) track in the raster's frame.
+class Maps(NamedTuple):
+    """A surface seen from above, with the track, scale and north."""
 
-    Each panel's longer side is at most ``largest_px``; ``lines`` are the key figures.
-    ``height_of_zero_m`` is added to the labelled heights.
-    """
-    colour, height = draw_maps(raster, track_m, largest_px, height_of_zero_m)
+    colour: U8  # (h, w, 3) BGR
+    height: U8  # (h, w, 3) BGR
+    cell_m: float  # of the surface
+
+
+def side_by_side(maps: Maps, lines: Sequence[str]) -> U8:
+    """(h, w, 3) BGR image of both panels, above each other where they are wide, over the key
+    figures ``lines``."""
+    colour, height, _ = maps
     h, w = colour.shape[:2]
     stacked = w > 1.3 * h
     gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
@@ -63,8 +62,12 @@ def draw_maps(
     largest_px: int = 1400,
     height_of_zero_m: float = 0.0,
     is_shaded: bool = True,
-) -> tuple[U8, U8]:
-    """The two panels of :func:`draw_preview`, colour (shaded by the relief or not) and height."""
+) -> Maps:
+    """``raster`` in colour, shaded by the relief or not, and in height, with the (N, 2 or 3) track
+    in the raster's frame.
+
+    The longer side is at most ``largest_px``; ``height_of_zero_m`` is added to heights in labels.
+    """
     shown = fill_holes(raster)
     shade = _relief(shown)
     lit = shade if is_shaded else np.ones_like(shade)
@@ -76,7 +79,7 @@ def draw_maps(
         _draw_scale_bar(panel, raster.grid.cell_m / scale)
         _draw_north(panel)
     _draw_height_legend(height, shown, height_of_zero_m)
-    return colour, height
+    return Maps(colour, height, raster.grid.cell_m)
 
 
 def draw_thumbnail(raster: Raster, bounds: Box, largest_px: int = 480) -> U8:

@@ -44,7 +44,7 @@ from service.scans.fused_cloud import (
     write_laz,
 )
 from service.scans.main_piece import in_words, main_poses, main_seqs, pieces_apart, stretches_apart
-from service.scans.report import report_html
+from service.scans.report import maps_of, report_html
 from service.scans.trust import SharedSigma, scale_sigma, shared_sigma, slope_deg, trust_of
 from service.scans.writing import SUMMARY, write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
@@ -107,8 +107,10 @@ def write_deliverables(
     release_memory()
     files.write_pieces()
     progress("writing the files")
-    _, summary = run_parallel(files.write_cloud, partial(files.draw, extra))
+    _, summary = run_parallel(files.write_cloud, partial(files.summarise, extra))
     assert summary is not None
+    release_memory()  # the images below take as much again
+    files.draw(summary)
     failures = files.failures
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
     write_whole(folder / SUMMARY, json.dumps(summary, indent=2, sort_keys=True) + "\n")
@@ -251,15 +253,25 @@ class _Files:
             with self.failures.noted(CLOUD):
                 self._write_laz([(self._fused.cloud, None, None)])
 
-    def draw(self, extra: dict[str, Any]) -> dict[str, Any]:
-        """Write the preview and the report; returns the content of scan.json."""
+    def summarise(self, extra: dict[str, Any]) -> dict[str, Any]:
+        """The content of scan.json, and the surface of the cloud."""
         with self.failures.noted(PREVIEW):
             self._raster = surface(self._fused, self._cell_m)
-        summary = self.summary(extra)
+        return self.summary(extra)
+
+    def draw(self, summary: dict[str, Any]) -> None:
+        """Write preview, thumbnail and report of the scan with this scan.json."""
         poses = main_poses(self._poses, stretches_apart(self._store))
+        maps = None
         with self.failures.noted(PREVIEW):
-            preview = _preview(self._raster, poses, summary, self._left_out)
-            write_whole(self._folder / PREVIEW, preview)
+            if self._raster is not None:
+                maps = maps_of(summary, poses, self._raster)
+            lines = [*key_figures(summary), *filter(None, [self._left_out])]
+            image = (
+                drawing.blank_preview(lines) if maps is None else drawing.side_by_side(maps, lines)
+            )
+            coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
+            write_whole(self._folder / PREVIEW, coded.tobytes())
         if self._raster is not None:
             with self.failures.noted(THUMBNAIL):
                 bounds = (
@@ -272,9 +284,8 @@ class _Files:
         with self.failures.noted(REPORT):
             shown = stages_jpg(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage
-            page = report_html(summary, poses, cloud, self._raster, coverage, shown)
+            page = report_html(summary, poses, cloud, self._raster, coverage, shown, maps)
             write_whole(self._folder / REPORT, page)
-        return summary
 
 
 class Failures:
@@ -388,20 +399,6 @@ def _position_sigmas(poses: Sequence[PoseRecord]) -> dict[str, float | None]:
         return dict.fromkeys(names)
     medians = np.median([(p.sigma_m, *p.sigma_h_v_m) for p in poses], axis=0)
     return dict(zip(names, medians.round(4).tolist(), strict=True))
-
-
-def _preview(
-    raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[str, Any], left_out: str
-) -> bytes:
-    """preview.jpg; ``left_out`` says what is not in it."""
-    lines = key_figures(summary) + ([left_out] if left_out else [])
-    if raster is None:
-        image = drawing.blank_preview(lines)
-    else:
-        places_m = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
-        zero = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
-        image = drawing.draw_preview(raster, places_m, lines, height_of_zero_m=zero)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 
 def key_figures(summary: dict[str, Any]) -> list[str]:

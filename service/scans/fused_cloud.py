@@ -102,7 +102,6 @@ def fused_cloud(
         say = partial(progress.counting(len(extents)), progress.text)
         strips = [_strip(store, extents, held, box, a, b, say) for a, b in pairwise(edges)]
         cloud = fuse_strips(strips, edges, size)
-        held.clear()
     release_memory()
     if len(cloud):
         with progress.part("removing points that other images see through"):
@@ -172,16 +171,23 @@ def _strip(
     high_m: float,
     say: Callable[[], None],
 ) -> Callable[[], Iterator[PointCloud]]:
-    """The clouds of the keyframes that overlap a strip, ``held`` or read on demand."""
+    """The clouds of the keyframes that overlap a strip, ``held`` or read on demand.
+
+    What no strip to the east needs is no longer held; a strip to the west that has not come to it
+    yet reads it again.
+    """
     margin = 1.0  # edges are moved by up to a voxel
-    seqs = [e.seq for e in extents if e.box[2] >= low_m - margin and e.box[0] <= high_m + margin]
+    inside = [e for e in extents if e.box[2] >= low_m - margin and e.box[0] <= high_m + margin]
 
     def clouds() -> Iterator[PointCloud]:
-        for seq in seqs:
+        for extent in inside:
             say()
-            if seq in held:
-                yield held[seq]
-            elif (keyframe := store.keyframe(seq)) is not None:
+            cloud = held.get(extent.seq)
+            if extent.box[2] < high_m - margin:
+                held.pop(extent.seq, None)
+            if cloud is not None:
+                yield cloud
+            elif (keyframe := store.keyframe(extent.seq)) is not None:
                 yield _points(keyframe, box)
 
     return clouds

@@ -20,7 +20,7 @@ from recon.camera_model import rays
 from recon.surface.raster import Raster
 from recon.types import F64, U8, PointCloud
 from service.scans.coverage import Coverage
-from service.scans.drawing import draw_maps
+from service.scans.drawing import Maps, draw_maps
 from service.scans.report_appendix import appendix
 from service.scans.report_map import map_figure
 from service.scans.report_parts import area, figure, height_sigma_m, length, table, within
@@ -52,15 +52,14 @@ def report_html(
     raster: Raster | None,
     coverage: Coverage | None = None,
     keyframe_jpg: bytes | None = None,
-    maps: Raster | None = None,
+    maps: Maps | None = None,
 ) -> str:
     """The report of a scan whose scan.json holds ``summary``.
 
-    ``raster`` is its upper surface in metres about its origin, and ``maps`` the same of orthophoto
-    and surface model where they are made; ``keyframe_jpg`` shows the stages of one keyframe.
+    ``raster`` is its upper surface in metres about its origin, and ``maps`` show that, or
+    orthophoto and surface model; ``keyframe_jpg`` shows the stages of one keyframe.
     """
-    is_shaded = maps is None  # an orthophoto has its own light
-    cover, colour, heights = _map_pages(summary, poses, maps or raster, is_shaded)
+    cover, colour, heights = _map_pages(summary, maps)
     sections = [
         ("first", [
             f"<h1>{escape(summary['id'])}</h1>",
@@ -96,16 +95,23 @@ def report_html(
     return f"{head}</title><style>{STYLE}</style><body>{body}</body></html>\n"
 
 
-def _map_pages(
-    summary: dict[str, Any], poses: Sequence[PoseRecord], raster: Raster | None, is_shaded: bool
-) -> tuple[list[str], list[str], list[str]]:
-    """A small view from above, the orthophoto and the surface model, with scale and colour bars."""
-    if raster is None:
-        return [], [], []
+def maps_of(
+    summary: dict[str, Any], poses: Sequence[PoseRecord], raster: Raster, is_shaded: bool = True
+) -> Maps:
+    """``raster``, in metres about the scan's origin, from above with the track of the poses."""
     track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
     zero_m = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
-    colour, heights = draw_maps(raster, track, 1400, zero_m, is_shaded)
-    cell = f"one cell is {length(raster.grid.cell_m)}"
+    return draw_maps(raster, track, 1400, zero_m, is_shaded)
+
+
+def _map_pages(
+    summary: dict[str, Any], maps: Maps | None
+) -> tuple[list[str], list[str], list[str]]:
+    """A small view from above, the orthophoto and the surface model, with scale and colour bars."""
+    if maps is None:
+        return [], [], []
+    colour, heights, cell_m = maps
+    cell = f"one cell is {length(cell_m)}"
     half = cv2.resize(colour, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     small = np.asarray(half, np.uint8)
     pages = (

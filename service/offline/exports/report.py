@@ -15,7 +15,7 @@ from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.tiles import box_around
 from service.scans.coverage import coverage_of
 from service.scans.folder import stages_jpg, surface
-from service.scans.report import report_html
+from service.scans.report import maps_of, report_html
 from service.scans.writing import SUMMARY, write_whole
 
 LARGEST_CELLS = 1400
@@ -31,10 +31,13 @@ def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
     folder, store = scan.folder, scan.store
     try:
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-        maps = maps_of(folder, scan.flown_frame, summary["heights"])
-        scan.progress("maps of the cloud; export ortho and dsm first" if maps is None else "report")
+        made = made_maps(folder, scan.flown_frame, summary["heights"])
+        scan.progress("maps of the cloud; export ortho and dsm first" if made is None else "report")
         cloud, raster, coverage = scan.fused.cloud, surface(scan.fused), coverage_of(store)
         shown = stages_jpg(folder, store)
+        maps = None
+        if seen := made or raster:  # an orthophoto has its own light
+            maps = maps_of(summary, scan.poses, seen, is_shaded=made is None)
         page = report_html(summary, scan.poses, cloud, raster, coverage, shown, maps)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
@@ -43,7 +46,7 @@ def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
     write_whole(out, page)
 
 
-def maps_of(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | None:
+def made_maps(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | None:
     """Colours of the orthophoto and heights of the surface model in the scan's ENU metres.
 
     None where one of them is missing, older than scan.json, or above another datum than

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from recon.surface.raster import Grid, Raster
+from recon.types import F64, U8
 from service.scans.drawing import (
     BACKGROUND,
     MARGIN,
     TRACK,
     blank_preview,
-    draw_preview,
+    draw_maps,
     draw_thumbnail,
+    side_by_side,
 )
 
 
@@ -25,9 +27,13 @@ def raster(rows: int, cols: int, cell_m: float = 1.0) -> Raster:
     return Raster(Grid(100.0, 200.0, cell_m, (rows, cols)), height, sigma, rgb)
 
 
+def preview(one: Raster, track_m: F64, lines: list[str], largest_px: int) -> U8:
+    return side_by_side(draw_maps(one, track_m, largest_px), lines)
+
+
 def test_colour_stands_in_its_corner_and_the_track_on_its_way() -> None:
     track = np.array([[100.0, 190.0, 50.0], [140.0, 190.0, 50.0]])
-    image = draw_preview(raster(40, 40), track, ["a line"], largest_px=400)
+    image = preview(raster(40, 40), track, ["a line"], largest_px=400)
     scale = 8  # at most eight pixels a cell
     panel = image[MARGIN : MARGIN + 40 * scale, MARGIN : MARGIN + 40 * scale].astype(int)
     assert panel[15, 15, 2] > 150 > panel[15, 15, 1]  # red in the north-west
@@ -39,7 +45,7 @@ def test_colour_stands_in_its_corner_and_the_track_on_its_way() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 300), (300, 2), (40, 41)])
 def test_any_shape_is_drawn(shape: tuple[int, int]) -> None:
-    image = draw_preview(raster(*shape), np.zeros((0, 3)), ["x" * 50], largest_px=300)
+    image = preview(raster(*shape), np.zeros((0, 3)), ["x" * 50], largest_px=300)
     assert image.dtype == np.uint8
     assert image.ndim == 3
 
@@ -59,7 +65,7 @@ def test_a_thumbnail_shows_the_raster_in_its_place() -> None:
 
 
 def test_large_rasters_are_reduced() -> None:
-    image = draw_preview(raster(900, 1100, 0.1), np.zeros((0, 3)), [], largest_px=500)
+    image = preview(raster(900, 1100, 0.1), np.zeros((0, 3)), [], largest_px=500)
     assert max(image.shape) < 1100
 
 
@@ -67,7 +73,7 @@ def test_labels_grow_with_the_panel() -> None:
     """The height of the dark letters of a line of text, over the image's height."""
     shares = []
     for rows in (400, 1400):
-        image = draw_preview(raster(rows, rows), np.zeros((0, 3)), ["Hill"], largest_px=rows)
+        image = preview(raster(rows, rows), np.zeros((0, 3)), ["Hill"], largest_px=rows)
         below = image[2 * MARGIN + rows - 8 :]
         dark = np.flatnonzero((below.max(axis=2) < 120).any(axis=1))
         shares.append(np.ptp(dark) / rows)
@@ -78,7 +84,7 @@ def test_labels_grow_with_the_panel() -> None:
 def test_long_lines_are_broken_before_the_edge(side: int) -> None:
     line = "doubtful: " + "; ".join(f"reason {n} of many" for n in range(20))
     one, many = (
-        draw_preview(raster(side, side), np.zeros((0, 3)), text, largest_px=side)
+        preview(raster(side, side), np.zeros((0, 3)), text, largest_px=side)
         for text in ([line[:8]], [line])
     )
     assert many.shape[0] > one.shape[0] + 20
@@ -90,7 +96,7 @@ def test_unknown_ground_is_left_blank_and_far_tracks_do_no_harm() -> None:
     one = raster(40, 40)
     one.height_m[:, 20:] = np.nan
     track = np.array([[1e12, -1e12, 0.0], [0.0, 0.0, 0.0]])
-    image = draw_preview(one, track, [], largest_px=40)
+    image = preview(one, track, [], largest_px=40)
     assert (image[MARGIN + 20, MARGIN + 30] == BACKGROUND).all()
 
 
