@@ -35,10 +35,10 @@ def reduced(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
     small, triangles = simplify(
         (vertices - middle).astype(np.float32), faces, target_count=largest_faces
     )
-    return mended(small.astype(np.float64) + middle, triangles.astype(np.int32))
+    return repaired(small.astype(np.float64) + middle, triangles.astype(np.int32))
 
 
-def mended(vertices: F64, faces: I32) -> tuple[F64, I32]:
+def repaired(vertices: F64, faces: I32) -> tuple[F64, I32]:
     """The surface without edges of more than two triangles, where sheets touch each other.
 
     A cone over each loop around such triangles takes their place.

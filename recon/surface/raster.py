@@ -375,7 +375,7 @@ def _smoothed(height_m: F32, tolerance_m: float, sigma_cells: float) -> F32:
 def _bands(rows: int, margin: int) -> Iterator[tuple[slice, slice]]:
     """Rows of a map with ``margin`` neighbours, and which of these are the band's own.
 
-    What a filter needs beside the map is several times as large as the map.
+    What a filter needs in addition to the map is several times as large as the map.
     """
     for top in range(0, rows, BAND_ROWS):
         first = max(top - margin, 0)

@@ -15,6 +15,7 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 SEGMENT_BYTES = 1400
@@ -111,14 +112,21 @@ class LinkEmulator:
     :attr:`up` is the traffic from the side that calls, the drone.
     """
 
-    def __init__(self, model: LinkModel, listen_port: int, target_port: int) -> None:
-        self._model = model
+    def __init__(
+        self,
+        model: LinkModel,
+        listen_port: int,
+        target_port: int,
+        loop: asyncio.AbstractEventLoop | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._model, self._clock = model, clock
         self._ports = listen_port, target_port
-        self.started = time.monotonic()
+        self.started = clock()
         self._up = _Direction(model, self.started, model.seed)
         self._down = _Direction(model, self.started, model.seed + 1)
         self.up = self._up.traffic
-        self._loop = asyncio.new_event_loop()
+        self._loop = loop or asyncio.new_event_loop()
         self._ready = threading.Event()
         self._thread = threading.Thread(target=self._run, name="link-emulator", daemon=True)
 
@@ -153,7 +161,7 @@ class LinkEmulator:
         await asyncio.start_server(self._accept, sock=listener, limit=CHUNK_BYTES)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        now = time.monotonic()
+        now = self._clock()
         await asyncio.sleep(self._up.resumes(now, FIRST_WAIT_S) - now)
         try:
             far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._ports[1])
@@ -175,10 +183,10 @@ class LinkEmulator:
         latest = 0.0
         with contextlib.suppress(OSError):
             while data := await reader.read(CHUNK_BYTES):
-                now = time.monotonic()
+                now = self._clock()
                 late = pipe.resumes(now, pipe.wait_s) - now
                 await asyncio.sleep(late)
-                now = time.monotonic()
+                now = self._clock()
                 out = pipe.send(len(data), now)
                 if late > 0 and _has_closed(writer):
                     break

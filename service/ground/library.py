@@ -178,7 +178,7 @@ class Library:
 
     @contextlib.contextmanager
     def changing(self, drone: str, scan: str) -> Iterator[Path]:
-        """The folder of a scan, which nobody else changes meanwhile."""
+        """The folder of a scan, which only the caller changes meanwhile."""
         folder = self.folder(drone, scan)
         with self._lock:
             yield folder

@@ -327,7 +327,7 @@ class Receiver:
 
     def _has_room(self, now: float) -> bool:
         """Whether one more drone may come. If need be one that never had a scan and is silent makes
-        way, else the silent one that brought least is told to end, with its scans."""
+        way, else the silent one that brought least is stopped, with its scans."""
         busy = self._busy
         if len(busy) < self.limits.drones:
             return True

@@ -426,5 +426,5 @@ if __name__ == "__main__":
     try:
         with ScanStore.open(Path(sys.argv[1]) / "scan.db") as opened:
             write_deliverables(Path(sys.argv[1]), opened, {})
-    except SkyreliefError as told:
-        sys.exit(str(told))
+    except SkyreliefError as error:
+        sys.exit(str(error))

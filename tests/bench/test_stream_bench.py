@@ -5,12 +5,10 @@ from __future__ import annotations
 import asyncio
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
 
-from service.bench import link_emulator
 from service.bench.link_emulator import LinkEmulator, LinkModel, Traffic, _Direction
 
 WIRE = 1400 + 52
@@ -39,16 +37,12 @@ def test_loss_has_its_share_and_stalls_a_stream() -> None:
     assert 100 < len(late) < 200
 
 
-def test_a_stream_with_losses_keeps_its_order_and_its_last_bytes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stream_with_losses_keeps_its_order_and_its_last_bytes() -> None:
     years_s = 1e8  # a machine that is up for so long has a coarse clock
-    monkeypatch.setattr(link_emulator, "time", SimpleNamespace(monotonic=lambda: years_s))
-    emulator = LinkEmulator(LinkModel(rate_kbit_s=1e6, delay_s=1.0, loss=0.5), 1, 2)
-    emulator._loop.close()
     at_s: list[float] = []
     plan = Mock(call_at=lambda at, *_: at_s.append(at))
-    monkeypatch.setattr(emulator, "_loop", plan)
+    model = LinkModel(rate_kbit_s=1e6, delay_s=1.0, loss=0.5)
+    emulator = LinkEmulator(model, 1, 2, loop=plan, clock=lambda: years_s)
 
     async def relay() -> None:
         reader = asyncio.StreamReader()

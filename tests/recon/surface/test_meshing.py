@@ -12,7 +12,7 @@ import pytest
 from sheets import height_mesh
 from typer.testing import CliRunner
 
-from recon.surface.meshing import Mesh, coarser, edges, largest_parts, mended, reduced
+from recon.surface.meshing import Mesh, coarser, edges, largest_parts, reduced, repaired
 from recon.surface.raster import Grid, Raster, smoothed
 from recon.types import F32
 from service.cli import app
@@ -60,12 +60,12 @@ def test_sheets_that_touch_at_an_edge_are_taken_apart() -> None:
     both, place = np.unique(both, axis=0, return_inverse=True)
     faces = place[np.vstack([one, one + 8])].astype(np.int32)
     assert edges(faces)[2].max() == 4
-    vertices, faces = mended(both, faces)
+    vertices, faces = repaired(both, faces)
     assert set(edges(faces)[2]) == {2}
     corners = vertices[faces]
     volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
     assert abs(volume) == pytest.approx(2.0, abs=0.7)
-    same = mended(box, one)
+    same = repaired(box, one)
     assert same[0] is box and same[1] is one
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 from loopback import until
+from spied import spied
 
 import service
 from service.commands import demo
@@ -35,15 +35,14 @@ def test_an_installed_wheel_brings_the_flight(tmp_path: Path) -> None:
 
 
 def test_kernels_of_partly_new_keyframes_are_compiled_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recon.backends.cpu.warm_up", lambda: None)
-    kernels = {}
-    for module, name in (
-        (plane_coders, "_encode_bits"), (plane_coders, "_decode_bits"), (plane_kernels, "calm"),
-    ):  # fmt: skip
-        kernels[name] = Mock(wraps=getattr(module, name))
-        monkeypatch.setattr(module, name, kernels[name])
+    kernels = [
+        spied(monkeypatch, module, name)
+        for module, name in (
+            (plane_coders, "_encode_bits"), (plane_coders, "_decode_bits"), (plane_kernels, "calm"),
+        )
+    ]  # fmt: skip
     demo.compile_kernels()
-    assert [name for name, kernel in kernels.items() if not kernel.called] == []
+    assert all(kernel.called for kernel in kernels)
 
 
 def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
