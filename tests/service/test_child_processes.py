@@ -12,7 +12,9 @@ from paths import ROOT
 
 from service.workers import python_command
 
-CHILDREN = {"service.cli", "service.ground.live_site", "service.commands.demo"}
+CHILDREN = {
+    "service.cli", "service.commands.demo", "service.ground.live_site", "service.scans.folder"
+}  # fmt: skip
 """Modules of ours that run as processes of their own."""
 
 

@@ -178,7 +178,7 @@ def test_two_renames_at_once_leave_one_whole(store: Path) -> None:
     library = Library(store)
     titles = [f"title {n}" * 20 for n in range(8)]
     threads = [
-        threading.Thread(target=library.label, args=("drone-1", "test-1", t[:200], [t[:9]]))
+        threading.Thread(target=library.label, args=("drone-1", "test-1", t[:200], [t[:9]], None))
         for t in titles
     ]
     for thread in threads:
