@@ -60,14 +60,15 @@ def panel(title: str, lines: dict[str, Curve], x0: float) -> list[str]:
             f'<text x="{at(keyframes, 0.0)[0]:.0f}" y="{bottom + 18:.0f}" text-anchor="middle" '
             f'fill="{INK}">{keyframes:,.0f}</text>'
         )
-    for (name, curve), colour in zip(lines.items(), COLOURS, strict=False):
+    for k, ((name, curve), colour) in enumerate(zip(lines.items(), COLOURS, strict=False)):
         places = [at(*point) for point in curve]
         way = " ".join(f"{px:.0f},{py:.0f}" for px, py in places)
         parts.append(f'<polyline points="{way}" fill="none" stroke="{colour}" stroke-width="2"/>')
+        label_px = 18 if k else -8  # the second curve is the lower one
         for (px, py), (_, value) in zip(places, curve, strict=True):
             parts.append(
                 f'<circle cx="{px:.0f}" cy="{py:.0f}" r="3" fill="{colour}"/><text '
-                f'x="{px:.0f}" y="{py - 8:.0f}" text-anchor="middle" font-size="11" '
+                f'x="{px:.0f}" y="{py + label_px:.0f}" text-anchor="middle" font-size="11" '
                 f'fill="{colour}">{amount(value, "")}</text>'
             )
         px, py = places[-1]

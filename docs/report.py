@@ -8,6 +8,7 @@ hand, at most ten lines) and ``tables``. A table has a ``title``, a ``note`` on 
 
 - ``columns`` and ``rows``,
 - ``list``: lines,
+- ``image``: a file of docs/images,
 - ``bench``: names of benchmarks; the newest result of each that ``make bench`` kept
   on a machine with ``machine`` in its name, of the figures that the regular expression ``only``
   fits,
@@ -84,7 +85,9 @@ def section(table: Json) -> Iterator[str]:
         yield wrapped(note)
     if table.get("commands"):
         yield commands_of(table)
-    if "list" in table:
+    if "image" in table:
+        yield f"![{table['title']}](../images/{table['image']})"
+    elif "list" in table:
         yield "\n".join(wrapped(line, "- ") for line in table["list"])
     else:
         yield grid(table["columns"], table["rows"])

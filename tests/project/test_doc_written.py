@@ -182,3 +182,11 @@ def test_the_table_of_tests_names_their_folders() -> None:
     named = re.findall(r"^\| (tests\S*) \|", text_of(ROOT / "CONTRIBUTING.md"), re.MULTILINE)
     files = (ROOT / "tests").rglob("test_*.py")
     assert named == sorted({file.parent.relative_to(ROOT).as_posix() for file in files})
+
+
+def test_the_diagram_of_growth_is_that_of_the_newest_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "docs")  # it draws with the other pages' scripts
+    module = script("growth")
+    assert text_of(module.IMAGES / "growth.svg") == module.diagram(module.curves()), (
+        "run make pages"
+    )
