@@ -107,10 +107,8 @@ def write_deliverables(
     release_memory()
     files.write_pieces()
     progress("writing the files")
-    _, summary = run_parallel(files.write_cloud, partial(files.summarise, extra))
+    _, summary = run_parallel(files.write_cloud, partial(files.draw, extra))
     assert summary is not None
-    release_memory()  # the images below take as much again
-    files.draw(summary)
     failures = files.failures
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
     write_whole(folder / SUMMARY, json.dumps(summary, indent=2, sort_keys=True) + "\n")
@@ -253,14 +251,11 @@ class _Files:
             with self.failures.noted(CLOUD):
                 self._write_laz([(self._fused.cloud, None, None)])
 
-    def summarise(self, extra: dict[str, Any]) -> dict[str, Any]:
-        """The content of scan.json, and the surface of the cloud."""
+    def draw(self, extra: dict[str, Any]) -> dict[str, Any]:
+        """Write preview, thumbnail and report; returns the content of scan.json."""
         with self.failures.noted(PREVIEW):
             self._raster = surface(self._fused, self._cell_m)
-        return self.summary(extra)
-
-    def draw(self, summary: dict[str, Any]) -> None:
-        """Write preview, thumbnail and report of the scan with this scan.json."""
+        summary = self.summary(extra)
         poses = main_poses(self._poses, stretches_apart(self._store))
         maps = None
         with self.failures.noted(PREVIEW):
@@ -286,6 +281,7 @@ class _Files:
             cloud, coverage = self._fused.cloud, self._coverage
             page = report_html(summary, poses, cloud, self._raster, coverage, shown, maps)
             write_whole(self._folder / REPORT, page)
+        return summary
 
 
 class Failures:
