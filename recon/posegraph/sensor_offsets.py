@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from recon import se3
+from recon import parallel, se3
 from recon.posegraph.alignment_readings import Alignment, from_middle
 from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.records import Node
@@ -142,6 +142,7 @@ def boresight(
     frames = np.array([se3.nearest_rotation(mean) for mean in each])
     turn, known = np.zeros(3), np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
     for _ in range(ROUNDS):
+        parallel.release_gil()
         Q = R_reported @ se3.so3_exp(turn)
         r = se3.each_so3_log(frames[of] @ R_odom @ Q.transpose(0, 2, 1))
         norms = np.sqrt(np.sum(known * r**2, axis=1))

@@ -7,8 +7,9 @@ import tracemalloc
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from spied import spied
 
-from recon import se3
+from recon import parallel, se3
 from recon.posegraph.sensor_offsets import BOUND_RAD, Constants, Turns, boresight, turns_of
 from recon.types import F64, PosePrior
 
@@ -73,6 +74,12 @@ def test_a_flight_in_hundreds_of_pieces_takes_little_memory() -> None:
     finally:
         tracemalloc.stop()
     assert most < 20 * sum(array.nbytes for piece in pieces for array in piece)
+
+
+def test_other_threads_run_between_its_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    released = spied(monkeypatch, parallel, "release_gil")
+    boresight([flown(np.radians([1.6, -1.2, 0.0]), [0.4, 0.4 + np.pi], 1)], 300.0)
+    assert released.call_count >= 2
 
 
 def test_noise_is_no_boresight_and_a_wrong_frame_neither() -> None:
