@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -14,8 +13,6 @@ import numpy as np
 from recon.calibration.board import Board, BoardView, Calibration, find_board
 from recon.types import F32, F64, U8
 from service.errors import InputError
-
-log = logging.getLogger(__name__)
 
 STILLS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm")
 VIDEO_STEP_S = 0.4

@@ -7,7 +7,6 @@ Drone and ground compute the same layer, because both read the same store. In fl
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,8 +26,6 @@ from service.scans.track import local_frame
 from service.scans.writing import write_whole
 from service.stream.store import ScanStore
 from service.workers import PROCESS
-
-log = logging.getLogger(__name__)
 
 IMAGE, FIGURES = "coverage.png", "coverage.json"
 MIN_VIEWS = 3
