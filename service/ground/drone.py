@@ -312,9 +312,11 @@ class DroneReceiver:
             return None
         self._unreadable.pop(name, None)
         scan = ReceivedScan(self.drone, name, path.parent, ScanIntake(store, self._station), now)
-        scan.is_written = self._closed.pop(name, None) is not None
-        if not scan.is_written:
+        closed = self._closed.pop(name, None)
+        if closed is None:
             scan.grew()
+        else:
+            scan.is_written, scan.trouble = True, closed["trouble"] or ""
         self._scans[name] = scan
         self._effects.append(Opened(scan))
         log.info("receiving %s/%s into %s", self.drone, name, scan.folder)

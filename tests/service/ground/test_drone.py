@@ -145,6 +145,8 @@ def test_a_scan_is_asked_for_written_and_aligned(trouble: str, tmp_path: Path) -
     assert one.writes == []
     one.pass_time(61.0)
     assert one.ground.scans == [] and one.ground.entries[0]["open"] is False
+    one.head()  # opens it again
+    assert one.ground.scans and one.ground.entries[0]["trouble"] == (trouble or None)
     one.close()
 
 
