@@ -305,11 +305,13 @@ def by_rays(shown: Triangles, camera: Camera) -> Draw:
 
     core: Any = o3d.core
     scene = ray_scene(shown.vertices_m, shown.faces)
+    K_corner = camera.K.copy()
+    K_corner[:2, 2] += 0.5  # Open3D counts from the corner of a pixel, not from its middle
 
     def draw(T: F64) -> tuple[U8, Bool]:
         w, h = camera.size_px
         looks = scene.create_rays_pinhole(
-            core.Tensor(camera.K), core.Tensor(np.asarray(se3.inverse(T))), w, h
+            core.Tensor(K_corner), core.Tensor(np.asarray(se3.inverse(T))), w, h
         )
         hit = scene.cast_rays(looks)
         covered: Bool = np.isfinite(hit["t_hit"].numpy())

@@ -17,7 +17,7 @@ from recon.camera_model import scaled
 from recon.types import Camera
 from service.cli import app
 from service.errors import InputError
-from service.offline.view_scoring import placed
+from service.offline.view_scoring import by_rays, depth_grids, placed
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -82,6 +82,16 @@ def test_each_product_is_drawn_at_the_poses_of_the_others(
     (image,) = images.glob("*.png")
     drawn = cv2.imread(str(image))
     assert drawn is not None and drawn.shape == (90, 4 * 160, 3)
+
+
+def test_a_depth_image_drawn_at_its_own_pose_is_its_own_image(house: HouseFlight) -> None:
+    keyframe = house.keyframe(0, 0.0)
+    h, w = keyframe.bgr.shape[:2]
+    camera = Camera(keyframe.depth.K, np.zeros(5), (w, h))
+    drawn, covered = by_rays(depth_grids([keyframe]), camera)(keyframe.depth.T_world_camera)
+    assert covered[1:-1, 1:-1].mean() > 0.9
+    off = np.abs(drawn[covered].astype(float) - keyframe.bgr[covered])
+    assert np.quantile(off, 0.9) <= 1.0
 
 
 def test_a_wrong_pose_is_seen(tmp_path: Path, house: HouseFlight) -> None:
