@@ -54,6 +54,9 @@ part: times are counted from its first one."""
 MAX_SLOPE = 0.03
 """Four pixels are one surface where their depths differ by less than this share."""
 
+LEVELS = 4
+"""Rounds in which the place on the ground that a pixel looks at is found."""
+
 POINT_PX = 3
 FLOOR_DB = 60.0  # PSNR of images that are the same
 
@@ -103,7 +106,7 @@ def frame_scores(
         from skimage.metrics import structural_similarity
     keyframes, camera = list(main_keyframes(scan.store)), camera_of(scan.store.header)
     products = {**_products(scan, keyframes, camera), **others}
-    inside, undistort = _outline(scan), Undistorter(camera)
+    inside, undistort = looks_inside(scan), Undistorter(camera)
     scores: dict[str, list[tuple[float, float, float]]] = {name: [] for name in products}
     for n, (T, seen) in enumerate(_seen(scan, keyframes, undistort, video, every)):
         counts = inside(camera, T) & (undistort.valid > 0)
@@ -231,25 +234,31 @@ def _products(scan: ScanView, keyframes: Sequence[Keyframe], camera: Camera) -> 
     return out
 
 
-def _outline(scan: ScanView) -> Callable[[Camera, F64], Bool]:
-    """Which pixels of a view look into the outline of the map, by its middle height."""
+def looks_inside(scan: ScanView) -> Callable[[Camera, F64], Bool]:
+    """Which pixels of a view look into the outline of the map: at the height of the cell where they
+    would meet the level of the cell before, beginning with the middle one."""
+    from scipy.ndimage import distance_transform_edt
+
     raster = scan.raster(None)
     is_inside = outlined(raster.known)
-    height = float(np.nanmedian(raster.height_m))
+    near = distance_transform_edt(~raster.known, return_distances=False, return_indices=True)
+    height_m = raster.height_m[tuple(near)]
     frame = scan.frame
 
     def inside(camera: Camera, T: F64) -> Bool:
         w, h = camera.size_px
         ways = _pixel_rays(camera.K, w, h) @ T[:3, :3].T
         middle = T[:3, 3] if frame is None else frame.to_utm(T[None, :3, 3])[0]
-        drop = np.where(ways[:, 2] < -0.05, (height - middle[2]) / np.minimum(ways[:, 2], -0.05), 0)
-        ground = T[:3, 3] + ways * drop[:, None]
-        places = ground if frame is None else frame.to_utm(ground)
-        on = raster.grid.holds(places[:, :2]) & (drop > 0)
-        out = np.zeros(len(places), np.bool_)
-        rows, cols = raster.grid.cells(places[on, :2])
-        out[on] = is_inside[rows, cols]
-        return out.reshape(h, w)
+        level_m = np.full(len(ways), float(np.nanmedian(raster.height_m)))
+        for _ in range(LEVELS):
+            down = np.minimum(ways[:, 2], -0.05)
+            drop = np.where(ways[:, 2] < -0.05, (level_m - middle[2]) / down, 0.0)
+            ground = T[:3, 3] + ways * drop[:, None]
+            places = ground if frame is None else frame.to_utm(ground)
+            on = raster.grid.holds(places[:, :2]) & (drop > 0)
+            rows, cols = raster.grid.cells(np.nan_to_num(places[:, :2]))
+            level_m = height_m[rows, cols].astype(np.float64)
+        return (on & is_inside[rows, cols]).reshape(h, w)
 
     return inside
 

@@ -6,6 +6,8 @@ import json
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +15,13 @@ import pytest
 from house_flight import HouseFlight
 from typer.testing import CliRunner
 
-from recon.camera_model import scaled
+from recon import se3
+from recon.camera_model import rays, scaled
+from recon.surface.raster import Grid, Raster
 from recon.types import Camera
 from service.cli import app
 from service.errors import InputError
-from service.offline.view_scoring import by_rays, depth_grids, placed
+from service.offline.view_scoring import by_rays, depth_grids, looks_inside, placed
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -92,6 +96,26 @@ def test_a_depth_image_drawn_at_its_own_pose_is_its_own_image(house: HouseFlight
     assert covered[1:-1, 1:-1].mean() > 0.9
     off = np.abs(drawn[covered].astype(float) - keyframe.bgr[covered])
     assert np.quantile(off, 0.9) <= 1.0
+
+
+def test_the_outline_is_that_of_sloping_ground() -> None:
+    grid = Grid(-20.0, 20.0, 0.1, (400, 400))
+    at = grid.centres(*np.indices(grid.shape).reshape(2, -1))
+    height_m = (0.3 * at[:, 0]).reshape(grid.shape).astype(np.float32)
+    height_m[:, :20] = np.nan  # the map begins at 18 m west
+    flat = np.zeros(grid.shape, np.float32)
+    raster = Raster(grid, height_m, flat, np.zeros((*grid.shape, 3), np.uint8))
+    scan: Any = SimpleNamespace(raster=lambda _: raster, frame=None)
+    camera = Camera(np.array([[60, 0, 40], [0, 60, 30], [0, 0, 1.0]]), np.zeros(5), (80, 60))
+    ahead = np.array([-0.6, 0.0, -0.8])  # to the west, down the slope
+    T = se3.compose(np.column_stack([[0, 1.0, 0], np.cross(ahead, [0, 1.0, 0]), ahead]), [0, 0, 20])
+    v, u = np.indices((60, 80))
+    ways = rays(camera.K, np.column_stack([u.ravel(), v.ravel()]).astype(float)) @ T[:3, :3].T
+    far = -20.0 / (ways[:, 2] - 0.3 * ways[:, 0])
+    x, y = (ways * far[:, None])[:, :2].T
+    expected = (x > -18.0) & (x < 20.0) & (np.abs(y) < 20.0)
+    assert 0.2 < expected.mean() < 0.9
+    assert (looks_inside(scan)(camera, T).ravel() == expected).mean() > 0.98
 
 
 def test_a_wrong_pose_is_seen(tmp_path: Path, house: HouseFlight) -> None:
