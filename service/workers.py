@@ -85,8 +85,10 @@ ROWS: tuple[Row, ...] = (
     # The ground.
     Row("front", "passes on connections of drones, within limits", 2, restarts=True,
         is_essential=True),
-    Row("receiver", "the session with the drones, and what they send", 1, None, "", _STALL_S,
+    Row("receiver", "keeps the session with the drones", 1, None, "", _STALL_S,
         True, True),
+    Row("messages", "takes messages of one kind, or the replies to a request", 1, restarts=True,
+        is_essential=True),
     Row("drone", "the scans of one drone", 3, None, "", _STALL_S, True),
     Row("deliverables", "files of received scans", 4, restarts=True, is_essential=True),
     Row("sites", "aligns finished scans of the same ground", 4, restarts=True),

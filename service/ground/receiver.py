@@ -5,9 +5,10 @@ finished scan is complete, and when the receiver closes, the deliverables are wr
 it. Everything may be killed at any time and started again.
 
 What a drone's messages ask for is decided in :mod:`service.ground.drone` and carried out here.
-Threads, all of the table of workers: one keeps the session and takes messages from it; each drone
-has one, so that none waits for another, until it is silent and has nothing open; one writes
-deliverables, and one aligns finished scans (:mod:`service.ground.sites`).
+Threads, all of the table of workers: one keeps the session; one takes each kind of message, and
+the replies to each request; each drone has one, so that none waits for another, until it is silent
+and has nothing open; one writes deliverables, and one aligns finished scans
+(:mod:`service.ground.sites`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ import queue
 import resource
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -42,11 +42,9 @@ from service.workers import Worker, Workers
 log = logging.getLogger(__name__)
 
 ASK_TIMEOUT_S = 120.0
-RETRY_S, LOOK_AROUND_S, POLL_S = 1.0, 3.0, 0.004
+RETRY_S, LOOK_AROUND_S, LOOK_S = 1.0, 3.0, 0.2
 CHANNEL = 256
 """Messages that may wait in the session, of one kind or to one request."""
-MAX_AT_ONCE = 64
-"""Messages of one kind or request that are taken before the next one's turn."""
 TICK_S, MAX_REST_S = 0.1, 0.5
 """After each turn a drone's worker rests as long as it computed, at most so long: one drone never
 takes more than half of a core."""
@@ -154,7 +152,7 @@ class Receiver:
         self.limits, self.workers = config.limits, workers or Workers()
         self._session: zenoh.Session | None = None
         self._session_config = config.session
-        self._sources: deque[tuple[Any, Callable[[], object]]] = deque()  # and what follows its end
+        self._takers: list[Worker] = []  # each ends with its request, or with the session
         self._lock = threading.RLock()  # of the table of drones, and of the radio
         self._drones: dict[str, Drone] = {}  # the last begun last
         self._tunnel = TunnelIntake()
@@ -239,19 +237,17 @@ class Receiver:
             finally:
                 self._session = None
                 session.close()
+                for taker in self._takers:
+                    taker.join()
 
     def _serve(self, session: zenoh.Session, worker: Worker) -> None:
-        """Take messages until the stop, or until the session ends.
-
-        Channels and a thread of our own: a callback's thread would belong to the library, and
-        end the process with an abort when it outlives the interpreter.
-        """
-        channel, ring = zenoh.handlers.FifoChannel(CHANNEL), zenoh.handlers.RingChannel(1)
+        """Have messages taken until the stop, or until the session ends."""
+        self._takers, ring = [], zenoh.handlers.RingChannel(1)
         for key in ("head", "item/*/*"):
-            subscriber = session.declare_subscriber(f"{ROOT}/*/*/{key}", channel)
-            self._sources.append((subscriber, lambda: None))
+            channel = zenoh.handlers.FifoChannel(CHANNEL)
+            self._take_from(session.declare_subscriber(f"{ROOT}/*/*/{key}", channel))
         look_at = 0.0
-        while not worker.stop.is_set() and not session.is_closed():
+        while not (worker.stop.wait(LOOK_S) or session.is_closed()):
             worker.beat()
             now = time.monotonic()
             if now >= look_at:
@@ -259,34 +255,31 @@ class Receiver:
                 if all(now - one.scans.heard_at > LOOK_AROUND_S for one in self._all):
                     with contextlib.suppress(zenoh.ZError):  # all present drones send their heads
                         session.get(f"{ROOT}/*/*/head", ring, timeout=LOOK_AROUND_S)
-            if not self._poll():
-                worker.stop.wait(POLL_S)
 
-    def _poll(self) -> bool:
-        """Take some messages of each source; whether there were any."""
-        has_news = False
-        for _ in range(len(self._sources)):
-            source, ended = self._sources.popleft()
-            try:
-                for _ in range(MAX_AT_ONCE):
-                    message = source.try_recv()
-                    if message is None:
-                        break
-                    has_news = True
-                    sample = message.ok if isinstance(message, zenoh.Reply) else message
-                    if sample is not None:
-                        self._take(str(sample.key_expr), sample.payload.to_bytes())
-            except zenoh.ZError:
-                ended()
-            else:
-                self._sources.append((source, ended))
-        return has_news
+    def _take_from(self, source: Any, ended: Callable[[], object] = lambda: None) -> None:
+        """Have a subscriber's samples, or the replies to a request, taken until their end.
+
+        A thread of our own: a callback's would belong to the library, and end the process with an
+        abort when it outlives the interpreter.
+        """
+
+        def work(_: Worker) -> None:
+            for message in source:
+                sample = message.ok if isinstance(message, zenoh.Reply) else message
+                if sample is not None:
+                    self._take(str(sample.key_expr), sample.payload.to_bytes())
+            ended()
+
+        with self._lock:
+            taker = self.workers.start("messages", work)
+            self._takers = [*(t for t in self._takers if not t.is_done), taker]
 
     def _take(self, key: str, payload: bytes) -> None:
         """Hand on what a drone has sent."""
         place = place_of(key)
         if place is None:
-            self._dropped += 1
+            with self._lock:
+                self._dropped += 1
         elif (one := self._drone(place[0])) is not None and key.endswith("/head"):
             one.put_head(place[1], payload)
         elif one is not None:
@@ -404,7 +397,7 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("%s is not sent: %s", effect.key, error)
             return
-        self._sources.append((replies, partial(one.put, effect.answered)))
+        self._take_from(replies, partial(one.put, effect.answered))
 
     def align(self, folder: Path) -> None:
         """Align a finished scan with those that show the same ground, if configured."""
