@@ -87,6 +87,7 @@ class VehicleHistory:
     ) -> None:
         """``wait`` is called with the seconds left (default: until a sample comes)."""
         self.config = config or HistoryConfig()
+        self.vertical_datum = ""  # of its altitudes; empty: mean sea level
         self._patience_s = patience_s
         self._lock = threading.Lock()
         self._news = threading.Condition()

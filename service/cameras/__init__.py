@@ -34,6 +34,21 @@ CAMERAS: dict[str, str] = {
 """Word to ``module:function(rest, options) -> CameraSource``; imported on first use."""
 
 
+UNREAD = frozenset(
+    (".heic", ".heif", ".avif", ".jxl", ".dng", ".gpr", ".arw", ".cr2", ".cr3", ".nef", ".orf")
+    + (".raf", ".rw2")
+)
+"""Stills as phones and cameras store them that no library here decodes."""
+
+
+def how_to_convert(path: Path) -> str:
+    """What to do with stills like ``path``, whose suffix is one of UNREAD, in words."""
+    return (
+        f"{path.suffix.lower()} images are not read: convert them to JPEG with their EXIF "
+        f"('magick mogrify -format jpg *{path.suffix}') and give the folder"
+    )
+
+
 def open_camera(source: str) -> CameraSource:
     """The camera that ``source`` names, open and with its first image decoded.
 

@@ -15,7 +15,7 @@ from statistics import median
 import numpy as np
 
 from recon.types import U8
-from service.cameras import reject_options
+from service.cameras import UNREAD, how_to_convert, reject_options
 from service.cameras.exif import Tags, read_tags
 from service.cameras.geo_file import geo_file_of, read_geo
 from service.cameras.lens import turned
@@ -127,14 +127,10 @@ class ImagesSource(CameraSource):
         return {path.name: time_ns for path, _, time_ns in self._stills}
 
     def _read(self, folder: Path) -> list[Still]:
-        paths = sorted(
-            (
-                p
-                for p in folder.iterdir()
-                if p.suffix.lower() in SUFFIXES and p.name[0] != "." and p.is_file()
-            ),
-            key=natural_key,
-        )
+        files = [p for p in folder.iterdir() if p.name[0] != "." and p.is_file()]
+        paths = sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=natural_key)
+        stems = {path.stem for path in paths}  # a camera may store each still twice
+        unread = [p for p in files if p.suffix.lower() in UNREAD and p.stem not in stems]
         tagged = []
         for path in paths:
             try:
@@ -142,6 +138,11 @@ class ImagesSource(CameraSource):
             except OSError as error:
                 why = " ".join(str(error).split())[:120] or type(error).__name__
                 self._warn(f"{path.name} is not a readable image ({why}); skipped")
+        if unread:
+            if not tagged:
+                raise InputError(f"{folder}: {how_to_convert(unread[0])}")
+            of_all = f"{len(unread)} of {len(unread) + len(tagged)}"
+            self._warn(f"{of_all} images are left out: {how_to_convert(unread[0])}")
         if not tagged:
             raise InputError(
                 f"{folder} contains no images (jpg, png, tif); give their folder{_inside(folder)}"
@@ -188,7 +189,7 @@ class ImagesSource(CameraSource):
         """The stills at the positions in ``geo``, and with none where it has none."""
         places, out, missing = read_geo(geo), [], 0
         for path, tags in tagged:
-            at, own = places.get(path.name.lower()), tags.geotag
+            at, own = places.get(path.name.lower(), places.get(path.stem.lower())), tags.geotag
             missing += at is None
             tag = at or (own and GeoTag(None, None))
             if tag is not None and own is not None:

@@ -11,14 +11,14 @@ import itertools
 import logging
 import sys
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime, timezone
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from mavlink.telemetry.samples import YEAR_2000_UNIX_S
-from service.cameras import open_container, reject_options
+from service.cameras import UNREAD, how_to_convert, open_container, reject_options
 from service.cameras.source import CameraFrame, CameraSource, Decoded
 from service.errors import InputError
 
@@ -297,13 +297,15 @@ def subtitles(path: Path) -> Iterator[tuple[int, str]]:
             yield time_ns, text
 
 
-def metadata(path: Path, marks: Sequence[bytes]) -> Iterator[tuple[int, int, bytes]]:
+def metadata(
+    path: Path, is_wanted: Callable[[bytes], bool]
+) -> Iterator[tuple[int, int, bytes]]:
     """(ns since the video's start, duration in ns, bytes) of the packets of a video's metadata, of
-    the first stream one of whose packets begins with one of ``marks``."""
+    the first stream with a packet that ``is_wanted``, from that packet on."""
     used: int | None = None
     for time_ns, duration_ns, packet in _packets(path, "data"):
         data = bytes(memoryview(packet)[:LARGEST_METADATA])
-        if used is None and data.startswith(tuple(marks)):
+        if used is None and is_wanted(data):
             used = packet.stream.index
         if packet.stream.index == used:
             yield time_ns, duration_ns, data
@@ -398,6 +400,8 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
         raise InputError(f"{path} is not a regular file; for a named pipe write pipe:{path}")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes); copy it from the camera again")
+    if path.suffix.lower() in UNREAD:
+        raise InputError(f"{path}: {how_to_convert(path)}")
     try:
         container = open_container(str(path))
     except av.error.InvalidDataError as error:

@@ -134,6 +134,8 @@ class Scan:
         )  # fmt: skip
         self.mapper, self.worker = self.pipeline.mapper, self.pipeline.worker
         self.rig = Rig(config.camera, config.scan, config.fusion)
+        if inputs.history is not None:
+            self.rig.vertical_datum = inputs.history.vertical_datum
         self._velocity = VelocityIntegrator()
         self.recorder = Recorder(
             store,

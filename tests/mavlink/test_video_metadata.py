@@ -110,6 +110,31 @@ def test_a_gopro_without_gpsu_is_dated_by_its_positions() -> None:
     assert began / 1e9 == pytest.approx(stated.timestamp(), abs=1e-6)
 
 
+def msl(packet: bytes) -> bytes:
+    """A packet of :func:`gps5` or :func:`gps9` that says above what its altitudes are."""
+    at = packet.index(b"STRM")
+    return gopro(item(b"GPSA", "F", 4, b"MSLV") + packet[at + 8 :])
+
+
+@pytest.mark.parametrize("packet", [gps5(47.0, 3, 1.4), gps9(47.0, 3, 1.4)])
+def test_altitudes_of_a_gopro_are_above_the_ellipsoid_unless_it_says_sea_level(
+    packet: bytes,
+) -> None:
+    for data, datum in ((packet, "ellipsoid"), (msl(packet), "")):
+        log = gpmf.of_packets(HERE, [(0, SECOND_NS, data)], HistoryConfig())
+        assert log.history.vertical_datum == datum
+
+
+def test_real_gopros_name_their_datum() -> None:
+    """A MAX at the beach of Carlsbad is 23 m under the sea, and above the ellipsoid 12 m."""
+    datums = {}
+    for name in ("max_0", "hero11_0", "karma_0"):
+        data = (REAL / f"{name}.gpmf").read_bytes()
+        log = gpmf.of_packets(HERE, [(0, SECOND_NS, data)], HistoryConfig())
+        datums[name] = log.history.vertical_datum
+    assert datums == {"max_0": "ellipsoid", "hero11_0": "", "karma_0": ""}
+
+
 def test_a_real_karma_gives_its_autopilots_position() -> None:
     packets = [
         (k * 1001 * 10**6, 1001 * 10**6, (REAL / f"karma_{k}.gpmf").read_bytes()) for k in (0, 1)
@@ -308,18 +333,18 @@ def test_sets_that_arrive_late_lie_at_their_own_times_and_date_the_video() -> No
     assert log.last_ns == found[-1] == stamps_ns[-1] - log.start_unix_ns
 
 
-def stream(path: Path, sets: Sequence[bytes]) -> None:
+def stream(path: Path, sets: Sequence[bytes], before: bytes = b"") -> None:
     """MPEG-TS of ten black images and a set after each second one; the sets' packets have no time,
-    as in a private stream (MISB ST 1402, asynchronous)."""
+    as in a private stream (MISB ST 1402, asynchronous). Of ``before`` is a stream of its own."""
     with av.open(str(path), "w", format="mpegts") as out:
         video = out.add_stream("mpeg2video", rate=5, options={"bf": "0"})
         video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
-        metadata = out.add_data_stream("klv")
+        streams = [out.add_data_stream("klv") for _ in range(2 if before else 1)]
         for k in range(10):
             image = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")
             out.mux(video.encode(image))
-            if k % 2:
-                packet = av.Packet(sets[k // 2])
+            for metadata in streams if k % 2 else ():
+                packet = av.Packet(sets[k // 2] if metadata is streams[-1] else before)
                 packet.stream, packet.time_base = metadata, Fraction(1, 90_000)
                 packet.pts = packet.dts = 18_000 * k
                 out.mux(packet)
@@ -343,6 +368,31 @@ def test_metadata_without_times_is_of_the_images_before_it(tmp_path: Path) -> No
     assert -SECOND_NS < log.first_ns < SECOND_NS
     state = at(log, 1e-9 * log.first_ns)
     assert (state.lat_deg, state.lon_deg) == pytest.approx((41.1438, -104.8056), abs=1e-4)
+
+
+STAMP_ALONE = klv.LOCAL_SET + bytes([10, 2, 8]) + (1_348_087_244_000_000).to_bytes(8, "big")
+TARGETS = bytes.fromhex("060e2b34020b01010e010301030600000000"[:32]) + b"\x02\x04\x00"
+
+
+@pytest.mark.parametrize("before", [STAMP_ALONE, TARGETS])
+def test_the_stream_with_a_place_is_read_of_several(tmp_path: Path, before: bytes) -> None:
+    path = tmp_path / "several.ts"
+    stream(path, cheyenne(), before)
+    log, _ = telemetry_inside(path, HistoryConfig()) or (None, "")
+    assert log is not None and log.counts["PositionSample"] == 5
+
+
+def test_a_video_of_stamps_alone_is_refused_in_words(tmp_path: Path) -> None:
+    path = tmp_path / "stamps.ts"
+    stream(path, [STAMP_ALONE] * 5)
+    with pytest.raises(ValueError, match="no attitude and no position"):
+        telemetry_inside(path, HistoryConfig())
+
+
+@pytest.mark.parametrize("before", [bytes([0, 7, 0x8F, 0x01, 0x21]), STAMP_ALONE, TARGETS])
+def test_a_set_is_read_behind_a_header_or_another_set(before: bytes) -> None:
+    assert klv.fields_of(before + cheyenne()[0]) == klv.fields_of(cheyenne()[0])
+    assert klv.fields_of(before) == {}
 
 
 def local_set(values: dict[int, tuple[int, bool, float]]) -> bytes:
@@ -371,6 +421,17 @@ def test_a_local_set_gives_place_and_direction() -> None:
     assert state.alt_amsl_m == pytest.approx(512.5, abs=0.2)
     assert state.alt_agl_m == pytest.approx(1000.0, abs=1.0)
     np.testing.assert_allclose(looks_at(state), [-math.cos(math.radians(30)), 0.0, 0.5], atol=1e-3)
+
+
+def test_an_altitude_above_the_ellipsoid_counts_where_no_other_is_there() -> None:
+    above = {tag: value for tag, value in LEVEL.items() if tag != 15}
+    for values, alt_m, datum in (
+        (above | {75: (16, False, (560.0 + 900) / 19_900)}, 560.0, "ellipsoid"),
+        (LEVEL | {75: (16, False, (560.0 + 900) / 19_900)}, 512.5, ""),
+    ):
+        log = klv.of_packets(HERE, [(0, 0, local_set(values))], HistoryConfig())
+        assert log.history.vertical_datum == datum
+        assert at(log, 0.0).alt_amsl_m == pytest.approx(alt_m, abs=0.2)
 
 
 def test_a_set_with_another_checksum_is_not_read() -> None:

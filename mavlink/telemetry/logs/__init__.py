@@ -99,6 +99,9 @@ class Track:
         return start_ns
 
 
+ELLIPSOID = "ellipsoid"
+"""The datum of altitudes that are not above mean sea level."""
+
 SAME_LENS = 0.02
 """Relative tolerance of a lens that does not zoom."""
 

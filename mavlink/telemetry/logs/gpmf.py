@@ -9,7 +9,8 @@ camera's stabilisation turns) and GRAV (gravity in the camera), of HERO8 and lat
 counts from an unknown direction. Their axes are x right, y down, z ahead. Times are the video's
 own; samples spread over the time of their packet, those of GPS9 and a drone by their own clock.
 GPSU dates the recording, whose container has local time; a HERO13 writes no GPSU, but GPS9 has a
-date of its own.
+date of its own. Altitudes are above the ellipsoid unless GPSA says MSLV: those of a HERO5 to 7, a
+Fusion and a MAX beside the sea are 35 m below it, as the ellipsoid is there.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from statistics import median_low
 
 from mavlink.telemetry.decode import HDOP_TO_M, plausible_place, receiver_accuracy
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, Track, finish
+from mavlink.telemetry.logs import ELLIPSOID, TelemetryLog, Track, finish
 from mavlink.telemetry.quaternion import (
     Quaternion,
     Vector,
@@ -82,6 +83,7 @@ class _Stream:
     fix: float = 3.0
     dop: float = math.nan
     utc_ns: int | None = None
+    is_amsl: bool = False
 
 
 def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
@@ -89,12 +91,13 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
     history, counts = VehicleHistory(config), Counter[str]()
     tracks: dict[bytes, Track] = defaultdict(Track)
     turned: dict[bytes, dict[int, tuple[float, ...]]] = {b"CORI": {}, b"IORI": {}, b"GRAV": {}}
-    dates_ns = list[int]()
+    dates_ns, amsl = list[int](), set[bytes]()  # amsl: items whose altitudes are
     for time_ns, duration_ns, data in packets:
         counts["packets"] += 1
         for key, rows, stream in _streams(data):
             if stream.utc_ns is not None and stream.fix >= 2.0:
                 dates_ns.append(stream.utc_ns - time_ns)
+            amsl |= {key} if stream.is_amsl or key == b"GLPI" else set()
             if key in turned:
                 times = (time_ns + i * duration_ns // len(rows) for i in range(len(rows)))
                 turned[key] |= zip(times, rows, strict=True)
@@ -114,6 +117,8 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
         tracks[name].fill(history)
     for time_ns, head in _heads(turned):
         history.add(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0, False), time_ns)
+    if used and used not in amsl:
+        history.vertical_datum = ELLIPSOID
     start_ns = median_low(dates_ns) if dates_ns else None
     return finish(path, history, counts, [], "video", start_unix_ns=start_ns)
 
@@ -183,6 +188,8 @@ def _streams(data: bytes) -> Iterator[tuple[bytes, list[tuple[float, ...]], _Str
             stream.scale = tuple(v for row in _rows(bytes([kind]), size, content) for v in row)
         elif key == b"TYPE":
             stream.kinds = content[:64]
+        elif key == b"GPSA":
+            stream.is_amsl = content.startswith(b"MSLV")
         elif key == b"GPSU":
             stream.utc_ns = _utc_ns(content)
         elif key in (b"GPSF", b"GPSP"):

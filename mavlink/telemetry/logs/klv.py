@@ -3,8 +3,10 @@
 A set is a key of 16 bytes, a BER length, and items of key, length, value: of the local set a tag
 and an integer over the item's range, of the universal set 16 bytes and a float. Read are the
 sensor's place, the platform's attitude, the sensor's direction, and the slant range, which gives
-the height above the ground that it sees. Of asynchronous metadata, whose packets have no time, the
-order in the file gives one; the sets' own time stamps space them evenly, and date the video.
+the height above the ground that it sees. An altitude above the ellipsoid counts where none is above
+mean sea level. A set may stand behind a header (synchronous metadata, MISB ST 1402) and behind sets
+that are not read. Of asynchronous metadata, whose packets have no time, the order in the file gives
+one; the sets' own time stamps space them evenly, and date the video.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from pathlib import Path
 
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import MAX_AGL_M, HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, Track, finish, one_lens
+from mavlink.telemetry.logs import ELLIPSOID, TelemetryLog, Track, finish, one_lens
 from mavlink.telemetry.logs.gpmf import Packet
 from mavlink.telemetry.quaternion import from_degrees, from_rpy, multiply
 from mavlink.telemetry.samples import (
@@ -34,7 +36,7 @@ from mavlink.wire.first_beat import CAMERA
 MARK = bytes.fromhex("060e2b34")
 LOCAL_SET = bytes.fromhex("060e2b34020b01010e01030101000000")
 UNIVERSAL_SET = bytes.fromhex("060e2b34020101010e01010201010000")
-MAX_ITEMS, CHECKSUM, STAMP = 256, 1, 2
+MAX_SETS, MAX_ITEMS, CHECKSUM, STAMP = 16, 256, 1, 2
 
 
 AGL_SHARE = 0.05
@@ -52,6 +54,7 @@ LOCAL: dict[int, tuple[str, float, float]] = {
     19: ("elevation", -180.0, 180.0),
     20: ("turned", 0.0, 360.0),
     21: ("slant", 0.0, 5_000_000.0),
+    75: ("hae", -900.0, 19_000.0),
     90: ("pitch", -90.0, 90.0),
     91: ("roll", -90.0, 90.0),
 }
@@ -79,16 +82,19 @@ UNIVERSAL: dict[bytes, str] = {
 def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
     """The history in the packets of a metadata stream; ValueError where they give none."""
     history, counts, views = VehicleHistory(config), Counter[str](), list[float]()
-    track, warnings = Track(), list[str]()
+    track, warnings, heights = Track(), list[str](), Counter[str]()
     for time_ns, _, data in packets:
         counts["packets"] += 1
         found = fields_of(data)
+        heights.update(found.keys() & {"alt", "hae"})
         views += [found["hfov"]] if 0.0 < found.get("hfov", 0.0) < 180.0 else []
         if samples := samples_of(found):
             own_ns = 1000 * round(found["time_us"]) if "time_us" in found else None
             track.add(time_ns, own_ns, samples)
             counts.update(type(sample).__name__ for sample in samples)
     start_ns = track.fill(history)
+    if heights["hae"] and not heights["alt"]:
+        history.vertical_datum = ELLIPSOID
     return finish(
         path, history, counts, warnings, "video", may_lag=True,
         hfov_deg=one_lens(views, "degrees", 2, warnings),
@@ -97,24 +103,36 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
 
 
 def fields_of(data: bytes) -> dict[str, float]:
-    """Values by name in the first set of a packet; empty for any other bytes."""
-    key, (content, _) = data[:16], _value(data, 16)
-    if key == UNIVERSAL_SET:
+    """Values by name in the first set of a packet that has more than a time; empty without one."""
+    end = 0
+    for _ in range(MAX_SETS):
+        if (start := data.find(MARK, end)) < 0:
+            break
+        content, after = _value(data, start + 16)
+        end = after if after > 0 else start + 1
+        found = _fields(data[start:end], content)
+        if found.keys() - {"time_us"}:
+            return found
+    return {}
+
+
+def _fields(whole: bytes, content: bytes) -> dict[str, float]:
+    """Values by name in one set; empty where it is not one that is read."""
+    if whole[:16] == UNIVERSAL_SET:
         pairs = (_universal(name[8:], value) for name, value in _items(content, 16))
-    elif key == LOCAL_SET and _is_sound(data, content):
+    elif whole[:16] == LOCAL_SET and _is_sound(whole):
         pairs = (_local(name, value) for name, value in _items(content, 1))
     else:
         return {}
     return {name: number for name, number in pairs if name and number is not None}
 
 
-def _is_sound(data: bytes, content: bytes) -> bool:
+def _is_sound(whole: bytes) -> bool:
     """Whether the checksum at the end of a local set, where there is one, is that of the set."""
-    if len(content) < 4 or content[-4:-2] != bytes([CHECKSUM, 2]):
+    if whole[-4:-2] != bytes([CHECKSUM, 2]):
         return True
-    end = data.index(content, 16) + len(content)
-    summed = sum(data[0 : end - 2 : 2]) * 256 + sum(data[1 : end - 2 : 2])
-    return summed & 0xFFFF == int.from_bytes(content[-2:], "big")
+    summed = sum(whole[0:-2:2]) * 256 + sum(whole[1:-2:2])
+    return summed & 0xFFFF == int.from_bytes(whole[-2:], "big")
 
 
 def _items(content: bytes, wide: int) -> Iterator[tuple[bytes, bytes]]:
@@ -170,7 +188,8 @@ def samples_of(found: dict[str, float]) -> list[Sample]:
     out: list[Sample] = []
     lat, lon = found.get("lat", math.nan), found.get("lon", math.nan)
     if plausible_place(lat, lon):
-        out.append(PositionSample(None, lat, lon, found.get("alt"), None, None))
+        alt = found.get("alt", found.get("hae"))
+        out.append(PositionSample(None, lat, lon, alt, None, None))
     head, down = None, 0.0  # down: of the optical axis
     body = from_degrees(*(found.get(name) for name in ("roll", "pitch", "heading")))
     on_body = from_degrees(*(found.get(name) for name in ("turned", "elevation", "azimuth")))

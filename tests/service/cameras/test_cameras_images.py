@@ -378,6 +378,21 @@ def test_a_position_of_another_day_is_not_used(tmp_path: Path) -> None:
     assert source.warnings == ["2 positions are far off all others: not used"]
 
 
+def test_stills_that_no_library_decodes_are_named_with_the_remedy(tmp_path: Path) -> None:
+    """Of a phone and of a drone's raw format; one beside its JPEG is no loss."""
+    for name in ("IMG_1.HEIC", "IMG_2.HEIC"):
+        (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic")
+    for source in (tmp_path, tmp_path / "IMG_1.HEIC"):
+        with pytest.raises(InputError, match=r"\.heic images are not read: convert") as refused:
+            open_camera(str(source))
+        assert "magick mogrify -format jpg *.HEIC" in str(refused.value)
+    write_still(tmp_path / "IMG_1.jpg", "2024:06:01 12:00:00", offset="+00:00")
+    said = open_camera(str(tmp_path)).warnings
+    assert said[0].startswith("1 of 2 images are left out: .heic images are not read")
+    write_still(tmp_path / "IMG_2.JPG", "2024:06:01 12:00:02", offset="+00:00")
+    assert open_camera(str(tmp_path)).warnings == []
+
+
 def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:
     for i in range(3):
         write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}", offset="+00:00")

@@ -54,6 +54,27 @@ def test_positions_in_any_coordinate_system(
     assert third.alt_amsl_m == 198.609 and not third.is_sigma_h_stated
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "a.jpg,8.5,47.3,412.5,0.02,0.05\r\nb.jpg,8.5,47.3\r\n",
+        "a.jpg, 8.5, 47.3, 412.5, 10, -90, 0, 0.02, 0.05\nb.jpg, 8.5, 47.3\n",
+        "a.jpg;8,5;47,3;412,5;0,02;0,05\r\nb.jpg;8,5;47,3",
+        "a.jpg 8,5 47,3 412,5 10 -90 0 0,02 0,05\nb.jpg 8,5 47,3 label, other\n",
+        "a.jpg\t8.5\t47.3\t412.5\t0.02\t0.05\nb.jpg\t8.5\t47.3\n",
+        "C:\\flight 1\\A.jpg;8.5;47.3;412.5;0.02;0.05\nimages/b.jpg 8.5 47.3",
+    ],
+)
+def test_what_separates_columns_and_decimals(tmp_path: Path, rows: str) -> None:
+    path = tmp_path / "geo.txt"
+    path.write_bytes(b"\xef\xbb\xbf" + f"EPSG:4326\r\n\n{rows}".encode())
+    found = read_geo(path)
+    a, b = found["a.jpg"], found["b.jpg"]
+    assert (a.lat_deg, a.lon_deg, a.alt_amsl_m) == (47.3, 8.5, 412.5)
+    assert (a.sigma_h_m, a.sigma_v_m) == (0.02, 0.05)
+    assert (b.lat_deg, b.alt_amsl_m, b.is_sigma_h_stated) == (47.3, None, False)
+
+
 @pytest.mark.parametrize(("code", "foot_m"), [(6360, 1200 / 3937), (8228, 0.3048)])
 def test_heights_in_feet_are_converted(tmp_path: Path, code: int, foot_m: float) -> None:
     """State plane coordinates, which ODM's own tests have (EPSG:2251): feet up as well."""
@@ -79,6 +100,7 @@ def test_heights_in_feet_are_converted(tmp_path: Path, code: int, foot_m: float)
         (["EPSG:4326", "a.jpg nan 47"], "line 2"),
         (["EPSG:32632", "a.jpg 1e300 1e300 5"], "line 2"),
         (["EPSG:4326", "a.jpg 8 47 1e9"], "line 2"),
+        (["EPSG:4326", "a.jpg 8 47", "A.JPG 8 47", "A.JPG 8 48"], "line 4: a.jpg is elsewhere in"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, lines: list[str], what: str) -> None:
@@ -99,7 +121,7 @@ def test_stills_are_where_the_file_says(tmp_path: Path) -> None:
     images.mkdir()
     for name in ("A.JPG", "B.JPG", "C.JPG"):
         Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(images / name)
-    rows = ["EPSG:4326", "a.jpg 8.5 47.3 412.5 0 0 0 0.03 0.05", "B.JPG 8.5 47.4 413"]
+    rows = ["EPSG:4326", "a 8.5 47.3 412.5 0 0 0 0.03 0.05", "B.JPG 8.5 47.4 413"]
     above = write(tmp_path / "geo.txt", *rows)
     for source in (str(images), f"images:{images}?geo={above}"):
         opened = open_camera(source)
