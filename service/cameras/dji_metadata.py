@@ -37,7 +37,7 @@ def stated_shutter(path: str) -> Shutter | None:
             for packet in islice(container.demux(), MAX_PACKETS) if tracks else ():
                 if packet.stream in tracks and packet.size:
                     return shutter_of_sample(bytes(memoryview(packet)[:MAX_BYTES]))
-    except (av.error.FFmpegError, OSError, ValueError):
+    except (av.error.FFmpegError, OSError, ValueError, IndexError):
         pass
     return None
 

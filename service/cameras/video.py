@@ -257,8 +257,9 @@ def decoded_frames(
     while True:
         try:
             packet = next(packets, None)
-        # IndexError: PyAV's, at the end of a stream that began late
-        except (av.error.FFmpegError, OSError, IndexError) as error:
+        except IndexError:  # PyAV's, at the end of a recording in which a stream began late
+            packet = None
+        except (av.error.FFmpegError, OSError) as error:
             broke_off(f"it is cut off: {error}")
             packet = None
         if packet is not None and not is_needed(packet):
@@ -297,9 +298,7 @@ def subtitles(path: Path) -> Iterator[tuple[int, str]]:
             yield time_ns, text
 
 
-def metadata(
-    path: Path, is_wanted: Callable[[bytes], bool]
-) -> Iterator[tuple[int, int, bytes]]:
+def metadata(path: Path, is_wanted: Callable[[bytes], bool]) -> Iterator[tuple[int, int, bytes]]:
     """(ns since the video's start, duration in ns, bytes) of the packets of a video's metadata, of
     the first stream with a packet that ``is_wanted``, from that packet on."""
     used: int | None = None
@@ -341,6 +340,8 @@ def _packets(path: Path, kind: str) -> Iterator[tuple[int, int, Any]]:
                         yield round(time_s * NS_PER_S), duration_ns, packet
                 else:
                     before_s = max(before_s, time_s)  # images are stored out of order
+    except IndexError:  # as of decoded_frames
+        pass
     except (av.error.FFmpegError, OSError, ValueError) as error:
         log.debug("%s: its %s ends: %s", path, kind, error)
 

@@ -622,6 +622,7 @@ def test_a_damaged_time_of_an_onboard_log_costs_its_message_only(tmp_path: Path)
     writer = dataflash_flight(True)
     writer.add("ATT", 1 << 63, 500, -1000, 9000, 3)
     writer.add("POS", 1 << 60, 473000000, 85000000, 512.5, 62.5, 60.0, 0)
+    writer.add("ATT", 1 << 25, 500, -1000, 9000, 3)  # 33 s: within any day
     path.write_bytes(writer.data)
     damaged = load_telemetry(path)
     assert (damaged.first_ns, damaged.last_ns) == (sound.first_ns, sound.last_ns)
@@ -1003,6 +1004,21 @@ def test_settings_of_the_history_reach_it() -> None:
     config = HistoryConfig(keep_s=1.0)
     log = load_telemetry(TURN, config)
     assert log.history.config is config
+
+
+def test_a_damaged_ulg_is_said_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """pyulog prints a line for each damaged message, where --json has its object."""
+    data = bytearray(shared("flight_logs/px4_auav_x21_68s.ulg").read_bytes()[:400_000])
+    rng = random.Random(1)
+    for _ in range(200):
+        data[rng.randrange(100_000, len(data))] ^= 1 << rng.randrange(8)
+    path = tmp_path / "damaged.ulg"
+    path.write_bytes(data)
+    log = load_telemetry(path)
+    assert "the log is damaged: parts of it were skipped" in log.warnings
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_ulg_that_breaks_off_within_a_damaged_message_ends(tmp_path: Path) -> None:

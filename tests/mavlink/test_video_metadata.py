@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta, timezone
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -22,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from mavlink.telemetry.history import HistoryConfig
 from mavlink.telemetry.logs import TelemetryLog, gpmf, klv
 from mavlink.telemetry.samples import VehicleState
+from service.cameras import open_camera, video
 from service.commands.missing_metadata import telemetry_inside
 
 SECOND_NS = 1_000_000_000
@@ -387,6 +389,37 @@ def test_a_video_of_stamps_alone_is_refused_in_words(tmp_path: Path) -> None:
     stream(path, [STAMP_ALONE] * 5)
     with pytest.raises(ValueError, match="no attitude and no position"):
         telemetry_inside(path, HistoryConfig())
+
+
+def test_a_stream_that_begins_late_ends_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where MPEG-TS grows a stream, PyAV may fail at the end of the file, after its packets."""
+    path = tmp_path / "late.ts"
+    stream(path, cheyenne())
+
+    class Late:
+        def __init__(self, opened: Any) -> None:
+            self.opened = opened
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.opened, name)
+
+        def __enter__(self) -> Late:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            self.opened.close()
+
+        def demux(self, streams: Any) -> Iterator[Any]:
+            yield from (packet for packet in self.opened.demux(streams) if packet.size)
+            raise IndexError("list index out of range")
+
+    monkeypatch.setattr(video, "open_container", lambda *args, **more: Late(av.open(*args)))
+    log, _ = telemetry_inside(path, HistoryConfig()) or (None, "")
+    assert log is not None and log.counts["PositionSample"] == 5
+    source = open_camera(str(path))
+    assert sum(1 for _ in source) == 10 and source.warnings == []
 
 
 @pytest.mark.parametrize("before", [bytes([0, 7, 0x8F, 0x01, 0x21]), STAMP_ALONE, TARGETS])

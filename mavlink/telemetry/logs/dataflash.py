@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,9 @@ from mavlink.wire.tlog import LATEST_USEC
 
 HEADER = b"\xa3\x95"
 UNIX_FROM_S = 1e9
+NEIGHBOUR_S = 10.0
+"""Messages of a log follow each other that closely; one that is farther off both is damaged."""
+
 FRESH_S = 0.25
 NEAR_S = 0.05
 """Rates of the body are known so long before and after a sample of theirs."""
@@ -55,9 +59,7 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     reader = _Reader()
     is_placed = False
     attitudes: list[tuple[AttitudeSample, float]] = []
-    for message in _messages(path, counts):
-        if not 0.0 <= message._timestamp < 1e-6 * LATEST_USEC:
-            continue  # damaged
+    for message in _in_time(_messages(path, counts)):
         name = message.get_type()
         counts[name] += 1
         sample = reader.sample(name, message)
@@ -80,18 +82,40 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     return finish(path, history, counts, warnings, "unix" if dated else "boot")
 
 
+def _in_time(messages: Iterable[Any]) -> Iterator[Any]:
+    """The messages that are close in time to the one before or after them."""
+    before_s = -math.inf
+    alone = None  # far from the one before
+    for message in messages:
+        time_s = message._timestamp
+        if not 0.0 <= time_s < 1e-6 * LATEST_USEC:
+            continue
+        if abs(time_s - before_s) <= NEIGHBOUR_S:
+            alone = None
+        elif alone is None or abs(time_s - alone._timestamp) > NEIGHBOUR_S:
+            alone = message
+            continue
+        else:
+            yield alone
+            alone = None
+        before_s = time_s
+        yield message
+
+
 TAIL_BYTES = 528
 """What an autopilot may leave unwritten at the end of a log, by pymavlink."""
 
 
 @contextmanager
 def _unheard() -> Iterator[None]:
-    """Drop what pymavlink's compiled indexer writes to stderr: a line for each damaged byte."""
+    """Drop what pymavlink prints, and what its compiled indexer writes to stderr: a line for each
+    damaged byte."""
     stderr = os.dup(2)
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
     try:
-        yield
+        with redirect_stdout(io.StringIO()):
+            yield
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
@@ -111,7 +135,11 @@ def _messages(path: Path, counts: Counter[str]) -> Iterator[Any]:
         raise ValueError(f"{path}: the .BIN log cannot be read ({error})") from error
     # Where the log is cut off, what was read before counts.
     with closing(log), suppress(Exception):
-        while (message := log.recv_match(type=list(_Reader.TABLE))) is not None:
+        while True:
+            with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+                message = log.recv_match(type=list(_Reader.TABLE))
+            if message is None:
+                return
             yield message
 
 

@@ -7,6 +7,7 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -123,14 +124,19 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
             f"{path}: reading .ulg needs pyulog; pip install 'skyrelief[logs]'"
         ) from error
     try:
-        with _LimitedFile(path) as file:
+        # pyulog prints a line for each damaged message.
+        with _LimitedFile(path) as file, redirect_stdout(io.StringIO()):
             log = ULog(file, [*TABLE, "home_position"])
     except (*BROKEN, ULogException) as error:
         raise ValueError(f"{path}: the .ulg log cannot be read ({error})") from error
     topics = {d.name: d.data for d in log.data_list if d.multi_id == 0 and "timestamp" in d.data}
     counts = Counter({name: len(data["timestamp"]) for name, data in topics.items()})
-    dropouts = len(log.dropouts)
-    return topics, counts, [f"{dropouts} dropouts while logging"] if dropouts else []
+    dropouts, warnings = len(log.dropouts), list[str]()
+    if dropouts:
+        warnings.append(f"{dropouts} dropouts while logging")
+    if log.file_corruption:
+        warnings.append("the log is damaged: parts of it were skipped")
+    return topics, counts, warnings
 
 
 class _LimitedFile(io.BufferedReader):

@@ -224,7 +224,7 @@ def test_all_images_of_any_format_are_passed_on(container: str) -> None:
 
 
 def test_a_stream_that_appears_late_only_ends_the_connection() -> None:
-    """PyAV raises IndexError when what it demuxes ends."""
+    """PyAV raises IndexError when what it demuxes ends; nothing is lost by that."""
     said = list[str]()
     with twenty_images() as (container, images):
         stream = container.streams.video[0]
@@ -236,7 +236,7 @@ def test_a_stream_that_appears_late_only_ends_the_connection() -> None:
             raise IndexError("list index out of range")
 
         frames = list(decoded_frames(packets(), stream, said.append, print))
-    assert len(frames) == 1 and said == ["it is cut off: list index out of range"]
+    assert len(frames) == 1 and said == []
 
 
 def test_no_image_comes_earlier_where_the_first_packets_were_parts() -> None:
