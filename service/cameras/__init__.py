@@ -34,7 +34,12 @@ CAMERAS: dict[str, str] = {
 """Word to ``module:function(rest, options) -> CameraSource``; imported on first use."""
 
 
-UNREAD = frozenset(".heic .heif .avif .jxl .dng .gpr .arw .cr2 .cr3 .nef .orf .raf .rw2".split())
+UNREAD = frozenset(
+    (
+        *(".heic", ".heif", ".avif", ".jxl"),
+        *(".dng", ".gpr", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".raf", ".rw2"),
+    )
+)
 """Stills as phones and cameras store them that no library here decodes."""
 
 
