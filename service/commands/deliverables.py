@@ -61,7 +61,8 @@ def export(
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
     if not to:
-        print(product_list())
+        if not as_json:
+            print(product_list())
         raise InputError("name what to export with --to, such as --to dsm")
     from service.offline.exports.maps import write_kinds
     from service.offline.exports.view import ExportOptions, ScanView

@@ -66,7 +66,7 @@ PACKAGES = {
 
 ENDINGS = {
     "contours": {".json": "contours", ".gpkg": "gpkg", ".dxf": "dxf"},
-    "laz": {".las": "laz"},
+    "laz": {".las": "laz", ".copc.laz": "copc"},
     "splat": {".spz": "splat"},
 } | {kind: {".tiff": kind} for kind in ("dsm", "dtm", "ortho", "coverage")}
 """Endings of a file besides the usual one, with the kind that writes it."""
@@ -87,12 +87,11 @@ def kind_of(kind: str, out: Path | None) -> str:
         if re.fullmatch(r"\.[a-z]+[0-9]?", out.suffix.lower()):
             raise InputError(f"{out}: {kind} is a folder; give its name without {out.suffix}")
         return kind
-    if out.name.lower().endswith(ending):
-        return kind
-    known = ENDINGS.get(kind, {})
-    if out.suffix.lower() in known:
-        return known[out.suffix.lower()]
-    endings = " or ".join([ending, *known])
+    known = {ending: kind} | ENDINGS.get(kind, {})
+    fitting = [one for one in known if out.name.lower().endswith(one)]
+    if fitting:
+        return known[max(fitting, key=len)]
+    endings = " or ".join(known)
     others = [k for k, (_, name, _) in EXPORTERS.items() if Path(name).suffix == out.suffix.lower()]
     hint = f"; {out.suffix} is --to {' or '.join(others)}" if others and out.suffix else ""
     raise InputError(f"{out}: {kind} is written as {endings}{hint}")

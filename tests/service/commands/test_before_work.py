@@ -92,6 +92,7 @@ def test_replay_refuses_a_folder_with_a_scan_before_it_reads_the_log(
         (["mesh", "--out", "x.obj"], "glb is written as .glb"),
         (["export", "--to", "dsm", "--out", "x.laz"], "dsm is written as .tif or .tiff; .laz is"),
         (["export", "--to", "gpkg", "--out", "x"], "gpkg is written as .gpkg"),
+        (["export", "--to", "laz", "--out", "x.ply"], "laz is written as .laz or .las or .copc"),
         (["export", "--to", "obj", "--out", "x.obj"], "obj is a folder"),
         (["export", "--to", "dsm", "--out", "/dev/null/x.tif"], "/dev/null is a file"),
         (["inspect", "--out", "x.jpg"], "the image is written as .png"),
@@ -102,10 +103,11 @@ def test_wrong_usage_is_refused_before_the_work(scan: Path, words: list[str], wh
     assert ended.returncode == 2 and why in ended.stderr and ended.stderr.count("\n") == 1
 
 
-def test_the_ending_decides_the_format_of_contours() -> None:
+def test_the_ending_decides_the_format() -> None:
     made = {end: kind_of("contours", Path("x" + end)) for end in (".geojson", ".gpkg", ".dxf")}
     assert made == {".geojson": "contours", ".gpkg": "gpkg", ".dxf": "dxf"}
-    assert kind_of("laz", Path("x.las")) == "laz"
+    clouds = {end: kind_of("laz", Path("x" + end)) for end in (".laz", ".LAS", ".copc.laz")}
+    assert clouds == {".laz": "laz", ".LAS": "laz", ".copc.laz": "copc"}
     for kind, (_, usual, _) in EXPORTERS.items():
         assert kind_of(kind, Path(usual)) == kind
 
