@@ -78,6 +78,17 @@ def edges(faces: I32) -> tuple[I64, I64, I64]:
     return np.column_stack([key // total, key % total]), number.reshape(faces.shape), count
 
 
+def face_neighbours(faces: I32) -> I32:
+    """(F, 3) the triangle across each edge (corner k to k + 1); -1 where not two share it."""
+    _, number, count = edges(faces)
+    order = np.argsort(number, axis=None, kind="stable")
+    first = (np.cumsum(count) - count)[count == 2]
+    one, other = order[first], order[first + 1]
+    out = np.full(3 * len(faces), -1, np.int32)
+    out[one], out[other] = other // 3, one // 3
+    return out.reshape(-1, 3)
+
+
 def largest_parts(vertices: F64, faces: I32, share: float) -> tuple[F64, I32]:
     """The parts with at least this ``share`` of the triangles of the largest one."""
     from scipy.sparse import coo_matrix

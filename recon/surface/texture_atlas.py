@@ -19,6 +19,14 @@ from recon.types import F32, F64, I32, I64, U8, Bool
 BORDER_PX = 2
 """Texels around a chart that repeat its colours, for filtering and the first mip levels."""
 
+MARGIN_PX = 1.5
+"""Texels so far from a chart are painted as if it went on: four around a place at its edge, and all
+of a triangle so narrow that no texel's centre lies in it."""
+
+LEAST_WEIGHT = -2.0
+"""Of a corner, for a place beyond the edge opposite: farther out a sliver goes on along its longest
+edge, as its own plane leads anywhere."""
+
 MAX_SCALE, MIN_SCALE = 2.0, 1 / 64
 BAND_ROWS = 512
 """Rows of the atlas whose borders are made at a time."""
@@ -145,18 +153,27 @@ class Palette:
     rgb: U8  # (V, 3) where no view has colour
 
 
-def paint(mesh: Mesh, layout: Layout, found: TriangleViews, label: I32, palette: Palette) -> U8:
-    """(h, w, 3) RGB atlas: each texel the mix of the views that fade there."""
+def paint(
+    mesh: Mesh, layout: Layout, found: TriangleViews, label: I32, neighbours: I32, palette: Palette
+) -> U8:
+    """(h, w, 3) RGB atlas: each texel the mix of the views that fade there; around each chart its
+    views go on, so that a viewer's mean of four texels shows no line where charts meet."""
     w, h = layout.size_px
     image = np.zeros((h, w, 3), np.uint8)
     done = np.zeros((h, w), np.bool_)
     views = palette.views
     pixels, start, sides = flat(views)
-    _paint(
-        np.ascontiguousarray(mesh.vertices_m, np.float64), mesh.faces, layout.uv_px, label,
-        found.view, palette.fade_view, palette.fade_share, palette.rgb, pixels, start, sides,
-        *cameras(views), palette.levels, image, done,
-    )  # fmt: skip
+    chart = layout.chart
+    is_open = (neighbours < 0) | (chart[neighbours] != chart[:, None])
+    is_border = (label >= 0) & is_open.any(axis=1)
+    for faces, margin_px in (
+        (np.arange(len(label)), 0.0), (np.flatnonzero(is_border), MARGIN_PX),
+    ):  # fmt: skip
+        _paint(
+            faces, margin_px, np.ascontiguousarray(mesh.vertices_m, np.float64), mesh.faces,
+            layout.uv_px, label, found.view, palette.fade_view, palette.fade_share, palette.rgb,
+            pixels, start, sides, *cameras(views), palette.levels, image, done,
+        )  # fmt: skip
     return bordered(image, done)
 
 
@@ -277,18 +294,39 @@ def _texel(
 
 
 @njit(cache=True, nogil=True)
+def _on_longest_edge(
+    uv: F64, x: float, y: float
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """Weights of the corners (3, 2) for the place on the longest edge that is next to (x, y)."""
+    longest, first = -1.0, 0
+    for k in range(3):
+        length = (uv[(k + 1) % 3, 0] - uv[k, 0]) ** 2 + (uv[(k + 1) % 3, 1] - uv[k, 1]) ** 2
+        if length > longest:
+            longest, first = length, k
+    p, q = uv[first], uv[(first + 1) % 3]
+    along = ((x - p[0]) * (q[0] - p[0]) + (y - p[1]) * (q[1] - p[1])) / longest
+    along = min(max(along, 0.0), 1.0)
+    if first == 0:
+        return 1.0 - along, along, 0.0
+    if first == 1:
+        return 0.0, 1.0 - along, along
+    return along, 0.0, 1.0 - along
+
+
+@njit(cache=True, nogil=True)
 def _paint(
-    vertices: F64, faces: I32, uv: F64, label: I32, seen: I32, fade_view: I32, fade_share: F32,
-    rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64, levels: F32, image: U8,
-    done: Bool,
+    painted: I64, margin: float, vertices: F64, faces: I32, uv: F64, label: I32, seen: I32,
+    fade_view: I32, fade_share: F32, rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64,
+    levels: F32, image: U8, done: Bool,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Fill the texels whose centres lie in a triangle; of a smaller one, its middle's texel."""
+    """Fill the texels whose centres lie in the ``painted`` triangles; with a ``margin`` those that
+    are not ``done`` so near to one."""
     height, width = done.shape
     blended = fade_view.shape[1]
     ids = np.empty(3 * blended + 1, np.int32)
     shares = np.empty(3 * blended + 1)
-    mixed, colour, depth = np.empty(3), np.empty(3), np.empty(3)
-    for f in range(len(faces)):
+    mixed, colour, depth, least = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for f in painted:
         ax, ay, bx, by = uv[f, 0, 0], uv[f, 0, 1], uv[f, 1, 0], uv[f, 1, 1]
         cx, cy = uv[f, 2, 0], uv[f, 2, 1]
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
@@ -303,20 +341,32 @@ def _paint(
             for j in range(blended):
                 ids[k * blended + j] = fade_view[p, j]
         ids[3 * blended] = own
-        slack = 0.0 if own >= 0 else 0.5  # squares of unseen triangles are filled whole
-        y0 = max(0, int(np.ceil(min(ay, by, cy) - 0.5)))
-        y1 = min(height - 1, int(np.floor(max(ay, by, cy) - 0.5)))
-        x0 = max(0, int(np.ceil(min(ax, bx, cx) - 0.5)))
-        x1 = min(width - 1, int(np.floor(max(ax, bx, cx) - 0.5)))
-        filled = False
-        for row in range(y0, y1 + 1 if area != 0.0 else y0):
+        least[:] = -1e-9 if own >= 0 else -0.5  # squares of unseen triangles are filled whole
+        if margin > 0.0 and area != 0.0:
+            reach = margin / abs(area)
+            least[0] = -reach * np.hypot(cx - bx, cy - by)
+            least[1] = -reach * np.hypot(ax - cx, ay - cy)
+            least[2] = -reach * np.hypot(bx - ax, by - ay)
+        y0 = max(0, int(np.ceil(min(ay, by, cy) - margin - 0.5)))
+        y1 = min(height - 1, int(np.floor(max(ay, by, cy) + margin - 0.5)))
+        x0 = max(0, int(np.ceil(min(ax, bx, cx) - margin - 0.5)))
+        x1 = min(width - 1, int(np.floor(max(ax, bx, cx) + margin - 0.5)))
+        for row in range(y0, y1 + 1):
             for col in range(x0, x1 + 1):
-                px, py = col + 0.5 - ax, row + 0.5 - ay
-                b = (px * (cy - ay) - (cx - ax) * py) / area
-                c = ((bx - ax) * py - px * (by - ay)) / area
-                a = 1.0 - b - c
-                if min(a, b, c) < -1e-9 - slack:
+                if margin > 0.0 and done[row, col]:
                     continue
+                a = b = c = 1.0 / 3.0
+                if area != 0.0:
+                    px, py = col + 0.5 - ax, row + 0.5 - ay
+                    b = (px * (cy - ay) - (cx - ax) * py) / area
+                    c = ((bx - ax) * py - px * (by - ay)) / area
+                    a = 1.0 - b - c
+                elif margin == 0.0:
+                    continue
+                if a < least[0] or b < least[1] or c < least[2]:
+                    continue
+                if min(a, b, c) < LEAST_WEIGHT:
+                    a, b, c = _on_longest_edge(uv[f], col + 0.5, row + 0.5)
                 a, b, c = a / depth[0], b / depth[1], c / depth[2]
                 whole = a + b + c
                 _texel(
@@ -324,12 +374,4 @@ def _paint(
                     pixels, start, sides, K, T, levels, ids, shares, colour, mixed,
                     image[row, col],
                 )  # fmt: skip
-                done[row, col] = filled = True
-        row, col = int((ay + by + cy) / 3.0), int((ax + bx + cx) / 3.0)
-        if not filled and not done[row, col]:
-            third = 1.0 / 3.0
-            _texel(
-                f, third, third, third, vertices, faces, seen, fade_share, rgb, pixels, start,
-                sides, K, T, levels, ids, shares, colour, mixed, image[row, col],
-            )  # fmt: skip
-            done[row, col] = True
+                done[row, col] = True

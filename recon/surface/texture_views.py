@@ -15,7 +15,7 @@ from numba import njit
 
 from recon.camera_model import project
 from recon.parallel import parallel_for
-from recon.surface.meshing import Mesh
+from recon.surface.meshing import Mesh, face_neighbours
 from recon.types import F32, F64, I32, I64, U8, Bool
 
 Rays = Callable[[F64, F64], F64]
@@ -74,8 +74,7 @@ def look(
     reach = rays_onto(mesh)
     vertices = np.asarray(mesh.vertices_m, np.float64)
     corners = vertices[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(normal, axis=1)
+    area, normal = steady_normals(corners, face_neighbours(mesh.faces))
     tolerance = 0.3 * float(np.sqrt(2.0 * np.median(area))) if len(area) else 0.0
     middle = corners.mean(axis=1)
     out = TriangleViews.none(len(mesh.faces))
@@ -87,10 +86,12 @@ def look(
         faces = np.flatnonzero(inside[mesh.faces].all(axis=1))
         towards = view.T_world_camera[:3, 3] - middle[faces]
         facing = np.einsum("ij,ij->i", normal[faces], towards)
-        faces = faces[facing > MIN_COSINE * 2.0 * area[faces] * np.linalg.norm(towards, axis=1)]
-        faces = faces[_free(reach, view, middle[faces], tolerance)]
+        is_seen = facing > MIN_COSINE * np.linalg.norm(towards, axis=1)
+        is_seen[is_seen] = _free(reach, view, middle[faces[is_seen]], tolerance)
+        faces, facing = faces[is_seen], facing[is_seen]
         middle_px = _projected(view, middle[faces])
-        resolution = np.sqrt(doubled_area(px[mesh.faces[faces]]) / (2.0 * area[faces]))
+        ahead = -towards[is_seen] @ view.T_world_camera[:3, 2]
+        resolution = np.sqrt(view.K[0, 0] * view.K[1, 1] * facing / ahead**3)
         places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
         colour, seen = _mean_colour(view.bgra, places)
         good = seen & np.isfinite(resolution)
@@ -100,6 +101,29 @@ def look(
         )  # fmt: skip
     progress(1.0)
     return out
+
+
+OWN_WEIGHT = 3.0
+EQUILATERAL = 0.25 * 3.0**0.5
+
+
+def steady_normals(corners: F64, neighbours: I32) -> tuple[F64, F64]:
+    """(F,) areas of triangles (F, 3, 3) and (F, 3) unit normals, means with those of their
+    ``neighbours`` (F, 3; -1: none): what is left of a sliver's own is noise, and it would take
+    another view than the surface around it.
+
+    A neighbour weighs no more than an equilateral triangle on the edge that both share, so that
+    no small triangle of a wall takes the normal of a large roof.
+    """
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(doubled, axis=1)
+    own = doubled / np.maximum(2.0 * area, 1e-12)[:, None]
+    total = OWN_WEIGHT * area[:, None] * own
+    for k in range(3):
+        edge = corners[:, (k + 1) % 3] - corners[:, k]
+        weight = np.minimum(area[neighbours[:, k]], EQUILATERAL * (edge**2).sum(axis=1))
+        total += np.where(neighbours[:, k] >= 0, weight, 0.0)[:, None] * own[neighbours[:, k]]
+    return area, total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
 def ray_scene(vertices_m: F64, faces: I32 | I64) -> Any:

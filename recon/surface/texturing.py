@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from scipy import sparse
 
-from recon.surface.meshing import Mesh, edges
+from recon.surface.meshing import Mesh, face_neighbours
 from recon.surface.texture_atlas import Layout, Palette, lay_out, paint
 from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
 from recon.types import F32, F64, I32, U8
@@ -68,7 +68,7 @@ def texture(
     mesh = replace(mesh, rgb=spread_colours(mesh.faces, mesh.rgb, found, slot, gains))
     assert mesh.rgb is not None
     palette = Palette(views, gains, fade_view, fade_share, mesh.rgb)
-    image = paint(mesh, layout, found, label, palette)
+    image = paint(mesh, layout, found, label, neighbours, palette)
     used = np.unique(label[label >= 0])
     charts = len(np.unique(layout.chart[label >= 0]))
     a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
@@ -133,17 +133,6 @@ PENALTY = 0.6
 
 ITERATIONS = 30
 DAMPING = 0.5
-
-
-def face_neighbours(faces: I32) -> I32:
-    """(F, 3) the triangle across each edge (corner k to k + 1); -1 where not two share it."""
-    _, number, count = edges(faces)
-    order = np.argsort(number, axis=None, kind="stable")
-    first = (np.cumsum(count) - count)[count == 2]
-    one, other = order[first], order[first + 1]
-    out = np.full(3 * len(faces), -1, np.int32)
-    out[one], out[other] = other // 3, one // 3
-    return out.reshape(-1, 3)
 
 
 def choose(found: TriangleViews, neighbours: I32) -> I32:

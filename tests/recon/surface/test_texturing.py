@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from itertools import product
 
+import cv2
 import numpy as np
 import pytest
 from sheets import height_mesh
 
 from recon.surface import triangle_grid
-from recon.surface.meshing import Mesh, cut
+from recon.surface.meshing import Mesh, cut, face_neighbours
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BAND_ROWS, BORDER_PX, bordered, lay_out, pack
-from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
+from recon.surface.texture_views import (
+    TextureView,
+    TriangleViews,
+    consistent,
+    look,
+    steady_normals,
+)
 from recon.surface.texturing import (
     PENALTY,
     SPREAD_RINGS,
     choose,
-    face_neighbours,
     fading,
     levels,
     spread_colours,
@@ -97,6 +103,43 @@ def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
     for channel in range(3):  # one gain and offset fit all of it: no step is left inside
         line = np.polyfit(truth[:, channel], colour[inner, channel], 1)
         assert np.abs(np.polyval(line, truth[:, channel]) - colour[inner, channel]).max() < 8.0
+
+
+def test_a_triangle_narrower_than_a_texel_has_colours_all_along() -> None:
+    thin = np.array([[0.0, 0.0, 0.0], [3.0, 1.3, 0.0], [3.0, 1.31, 0.0]])
+    faces = np.array([[0, 1, 2]], np.int32)
+    done = texture(
+        Mesh(thin, faces, None, np.zeros((3, 3), np.uint8)), [image(np.array([0, 0, 14.0]))]
+    )
+    assert done.seen_share == 1.0 and done.mesh.uv is not None
+    along = np.linspace(0.0, 1.0, 60)[:, None]
+    weights = np.hstack([1.0 - along, 0.5 * along, 0.5 * along])
+    h, w = done.image.shape[:2]
+    u, v = ((weights @ done.mesh.uv[done.mesh.faces[0]]) * [w, h] - 0.5).astype(np.float32).T
+    seen = cv2.remap(done.image, u, v, cv2.INTER_LINEAR).reshape(-1, 3)
+    place = weights @ done.mesh.vertices_m[done.mesh.faces[0]]
+    assert np.abs(seen - pattern(place[:, 0], place[:, 1])).max() < 4.0
+
+
+def test_a_sliver_has_the_normal_of_the_surface_around_it_and_a_wall_its_own() -> None:
+    mesh = sheet(step_m=3.0, cells=20)
+    faces, vertices = mesh.faces.tolist(), mesh.vertices_m.tolist()
+    inner = np.abs(mesh.vertices_m[mesh.faces].mean(axis=1) - [-3.0, 0.0, 0.0]).sum(axis=1)
+    a, b, c = faces.pop(int(inner.argmin()))  # gets a sliver along an edge, out of its plane
+    low = 0.49 * (np.add(vertices[a], vertices[b])) + 0.02 * np.array(vertices[c]) + [0, 0, 0.05]
+    vertices.append(low.tolist())
+    n = len(vertices) - 1
+    faces += [[a, b, n], [b, c, n], [c, a, n]]
+    found = np.array(faces, np.int32)
+    corners = np.array(vertices)[found]
+    area, normal = steady_normals(corners, face_neighbours(found))
+    own = (
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / (2 * area)[:, None]
+    )
+    assert own[-3, 2] < 0.5 < 0.97 < normal[-3, 2]
+    walls = np.abs(own[:, 2]) < 0.2
+    walls[-3:] = False
+    assert walls.any() and (np.einsum("ij,ij->i", own, normal)[walls] > 0.85).all()
 
 
 def test_visibility_is_that_of_exact_rays() -> None:
