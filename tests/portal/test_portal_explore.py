@@ -409,3 +409,33 @@ def test_a_keyframe_whose_first_depth_is_void_is_gone(
         assert "1.jpg" in asked and not {"2.jpg", "3.jpg"} & asked  # no whole image is there yet
         browser.open("about:blank")
         portal.close()
+
+
+def test_a_first_depth_hides_no_surface_and_closes_what_has_none(
+    browser: Browser, tmp_path: Path, house: HouseFlight
+) -> None:
+    """It is coarse and blurred, and here a metre too high."""
+    pink = f"document.body.dataset.still === 'yes' && 1 + {LIKE.format(200, 0, 200)}"
+    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
+    header = ScanHeader("test-1", "drone-1", 1)
+    with ScanStore.create(tmp_path / "drone-1/test-1/scan.db", header) as store:
+        for seq in (0, 1):
+            one = house.keyframe(seq, 5.0 * seq)
+            store.add_keyframe(seq, encode(one, one.time_ns))
+        portal.start()
+        browser.open("about:blank")
+        browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1/20,-0.1,90,20,0,0")
+        browser.wait("document.body.dataset.points === '28800'")
+        shares = [browser.wait(pink) - 1]
+        for seq, east_m in ((2, 2.5), (3, 40.0)):
+            one = house.keyframe(seq, east_m)
+            near = replace(one.depth, depth_m=one.depth.depth_m - 1)
+            bgr = np.full_like(one.bgr, (200, 0, 200))
+            first = encode(replace(one, depth=near, bgr=bgr), one.time_ns)[0]
+            assert store.put_record("first", seq, first)
+            browser.wait(f"document.body.dataset.chunk.startsWith('{seq} ')")
+            browser.run("new Promise(r => setTimeout(r, 1000))")
+            shares.append(browser.wait(pink) - 1)
+    browser.open("about:blank")
+    portal.close()
+    assert shares[0] == 0.0 and shares[1] < 0.003 and shares[2] > 0.03, shares

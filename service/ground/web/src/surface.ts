@@ -2,7 +2,7 @@
 // vertex shader displaces along the rays of its camera.
 
 import * as THREE from "three";
-import { type Chunk, sigmaAt, viewsAt } from "./depth";
+import { type Chunk, FIRST, sigmaAt, viewsAt } from "./depth";
 
 /** Pixels of the depth image between two vertices, by level. */
 const STEPS = [1, 2, 4, 8, 16];
@@ -19,6 +19,7 @@ const DIP = 0.006; // of depth, by which each of them lies lower: the skirt of a
 /** What is not measured is drawn as if it were farther, so that it hides nothing measured: by this share of the depths
  * of the images, skirts by half of it. */
 export const BEHIND = 0.08;
+const FIRST_BEHIND = 0.7; // of it, for a first depth: coarse and blurred, it hides no surface, but the ground below
 /** GLSL: where a place of the view is drawn when it is to lie behind by a share of `behind`. */
 export const DRAWN_BEHIND = /* glsl */ `
   uniform float behind;   // m
@@ -42,10 +43,11 @@ const VERTEX = /* glsl */ `
   uniform vec4 K;
   uniform vec2 inverse;   // of code 0, and its step
   uniform vec2 corner;
+  uniform float first;    // by which it lies behind as a whole
   varying vec2 place;
   varying vec3 where;
   varying vec2 sure;      // sigma, m, and views
-  varying float measured; // 1, or less for a skirt
+  varying float measured; // 1, or less for a skirt and a first depth
   ${DRAWN_BEHIND}
   #include <clipping_planes_pars_vertex>
   void main() {
@@ -54,7 +56,7 @@ const VERTEX = /* glsl */ `
     vec2 p = pixel.xy - vec2(skirt * float(${SKIRT}), 0.0) - float(${OUTSIDE_PX}) + corner;
     vec4 world = modelMatrix * vec4((p - K.zw) / K.xy * z, z, 1.0);
     vec4 mvPosition = viewMatrix * world;
-    measured = 1.0 - 0.5 * skirt;
+    measured = (1.0 - first) * (1.0 - 0.5 * skirt);
     gl_Position = drawn(mvPosition, 1.0 - measured);
     float code = floor(pixel.w / 256.0);
     sure = vec2(code > 0.0 ? 0.001 * exp2((code - 1.0) / 4.0) * length(modelMatrix[2].xyz) : 0.0, pixel.w - 256.0 * code);
@@ -114,6 +116,7 @@ export class Surface {
         K: { value: new THREE.Vector4(...K) },
         inverse: { value: new THREE.Vector2(low, step) },
         corner: { value: new THREE.Vector2(box[0], box[1]) },
+        first: { value: chunk.layer === FIRST ? FIRST_BEHIND : 0 },
       },
     });
     this.sphere = reach(chunk);
