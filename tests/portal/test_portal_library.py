@@ -180,3 +180,50 @@ def test_the_export_dialog_says_what_each_product_is_and_makes_it(
         browser.wait("!!document.querySelector('dialog')")
         browser.run("location.hash = '#/view/drone-1/test-1'")
         browser.wait("!document.querySelector('dialog') && !!document.querySelector('.view')")
+
+
+def test_an_upload_is_seen_at_work_and_then_on_the_card_of_its_scan(
+    browser: Browser, store: Path, tmp_path: Path
+) -> None:
+    """What is chosen closes the menu, which lay over the job and its button."""
+    video = tmp_path / "flight.mp4"
+    video.write_bytes(b"a video")
+    job = {
+        "number": 1, "drone": "upload", "scan": "flight.mp4", "kind": "scan", "title": "Replay",
+        "state": "running", "doing": "tracking", "percent": 40, "left_s": 60, "ended_s": None,
+        "file": None, "error": None,
+    }  # fmt: skip
+    menu, bar = "document.querySelector('.import')", "document.querySelector('header ~ .jobs li')"
+    with listing(browser, store, 3):
+        browser.page.route("**/api/upload*", lambda route: route.fulfill(status=202, json=job))
+        browser.page.route("**/api/jobs", lambda route: route.fulfill(json=[job]))
+        browser.page.click("summary:text('Add scans')")
+        browser.key("Escape")
+        assert not browser.run(f"{menu}.open")
+        browser.page.click("summary:text('Add scans')")
+        browser.page.set_input_files(".import input[type=file]", video)
+        browser.wait(f"!{menu}.open && {bar}?.textContent.includes('40 % · 60 s left')")
+        assert "Replay of flight.mp4" in browser.run(f"{bar}.textContent")
+        job |= {"state": "done", "percent": 100, "file": "drone-3/test-3", "ended_s": 1.0}
+        browser.wait("document.querySelectorAll('article .made li').length === 1")
+        made = browser.run(
+            "document.querySelector('article .made li').closest('article').innerText"
+        )
+        assert "drone-3" in made and browser.run(f"{bar} === null")
+        assert browser.run("document.querySelector('article .made a').hidden")  # no file of it
+        browser.page.unroute_all(behavior="ignoreErrors")
+
+
+def test_names_on_the_map_stay_within_it_whatever_its_size(browser: Browser, store: Path) -> None:
+    outside = """[...document.querySelectorAll('.outlines text, .outlines circle')].filter(t => {
+      const map = document.querySelector('.overview .map');
+      const [a, b] = [t, map].map(e => e.getBoundingClientRect());
+      return a.left < b.left || a.right > b.right || a.top < b.top || a.bottom > b.bottom; })
+      .map(t => t.textContent)"""
+    with listing(browser, store, 3):
+        for size in ((1280, 800), (390, 844), (844, 390)):
+            browser.screen(*size)
+            browser.run("new Promise(r => setTimeout(r, 300))")
+            assert browser.run("document.querySelectorAll('.outlines circle').length") == 2
+            assert browser.run(outside) == [], size
+        browser.screen(1280, 800)

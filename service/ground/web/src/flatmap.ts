@@ -167,7 +167,11 @@ export class FlatMap {
   zoom = 18;
   isFree = true; // until somebody moves it, it shows what `frame` gave it
   private readonly bar = svg("svg", { class: "scale", width: "200", height: "30" });
-  private readonly resized = new ResizeObserver(() => this.draw());
+  private framed: Bounds | null = null;
+  private readonly resized = new ResizeObserver(() => {
+    if (this.isFree && this.framed) this.frame(this.framed);
+    this.draw();
+  });
 
   constructor(readonly host: HTMLElement) {
     const nearer = el("button", { textContent: "+", title: "nearer", onclick: () => this.zoomTo(this.zoom + 1) });
@@ -225,7 +229,8 @@ export class FlatMap {
     return (EQUATOR_M * Math.cos((lat * Math.PI) / 180)) / (SIDE * 2 ** this.zoom);
   }
 
-  frame([west, south, east, north]: Bounds): void {
+  frame(bounds: Bounds): void {
+    const [west, south, east, north] = (this.framed = bounds);
     const [a, b] = [placeOf(north, west), placeOf(south, east)];
     this.middle = { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2 };
     const fit = Math.min(this.host.clientWidth / (b.x - a.x), this.host.clientHeight / (b.y - a.y)) / SIDE;

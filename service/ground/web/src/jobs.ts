@@ -24,6 +24,9 @@ export function jobsOf(scan: () => api.Scan): HTMLElement {
   });
 }
 
+/** The scan that a job belongs to, as `keyOf` names it: an upload's is the one it has become. */
+export const ownerOf = ({ kind, state, file, drone, scan }: api.Job): string => (kind === "scan" && state === "done" && file ? file : `${drone}/${scan}`);
+
 /** What a job's scan is called; null: the job is not shown. */
 type NameOf = (job: api.Job) => string | Promise<string> | null;
 
@@ -81,6 +84,7 @@ function row(job: api.Job, name: string): Row {
 /** The address of what a job has made; null for folders, which are no download. */
 function madeAt(job: api.Job): string | null {
   if (job.kind === "all") return `${api.scanAddress(job)}/maps.zip`;
+  if (job.kind === "scan") return null; // it is the card
   return job.file?.includes(".") ? api.file(job, job.file) : null;
 }
 

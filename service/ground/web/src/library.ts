@@ -4,7 +4,7 @@ import * as api from "./api";
 import { count, date, el, notify, unbroken } from "./dom";
 import { askText } from "./dialog";
 import { homeInDialog, showExports } from "./exports";
-import { jobList } from "./jobs";
+import { jobList, ownerOf } from "./jobs";
 import { nameOf, placeName } from "./names";
 import { keyOf, Overview } from "./overview";
 import * as units from "./units";
@@ -47,7 +47,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload), leave),
     cut,
     line,
-    jobList(title, (job) => homeInDialog(job) ?? cards.get(keyOf(job))?.element.querySelector(".made") ?? null),
+    jobList(title, (job) => homeInDialog(job) ?? cards.get(ownerOf(job))?.element.querySelector(".made") ?? null),
     overview.element,
     which,
     list,
@@ -153,19 +153,24 @@ function empty(filtered: boolean): HTMLElement {
 function importForm(again: () => void, upload: (files: FileList | null) => void): HTMLElement {
   const folder = el("input", { placeholder: "folder or .mcap on this machine", size: 30 });
   folder.setAttribute("aria-label", "folder to import");
+  const box = el("details", { className: "group import" });
+  const close = (): void => void (box.open = false); // it would cover the jobs
   const act = el("button", {
     textContent: "Import",
-    onclick: () => void api.importFolder(folder.value).then(() => (again(), notify(`${folder.value} is imported`)), notify),
+    onclick: () => (close(), void api.importFolder(folder.value).then(() => (again(), notify(`${folder.value} is imported`)), notify)),
   });
   const chosen = el("input", { type: "file", multiple: true, hidden: true });
-  chosen.onchange = () => upload(chosen.files);
+  chosen.onchange = () => (close(), upload(chosen.files));
   const send = el("button", {
     textContent: "Upload",
     title: "a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log",
     onclick: () => chosen.click(),
   });
   const menu = el("div", { className: "settings" }, el("p", {}, folder, act), el("p", {}, send, "or drop files on this page"), chosen);
-  return el("details", { className: "group import" }, el("summary", { textContent: "Add scans" }), menu);
+  const summary = el("summary", { textContent: "Add scans" });
+  box.onkeydown = ({ key }) => key === "Escape" && box.open && (close(), summary.focus());
+  box.append(summary, menu);
+  return box;
 }
 
 /** Uploads files that are chosen, or dropped on the page; a video goes with the other files, which

@@ -7,7 +7,7 @@ import { nameOf } from "./names";
 
 const MIN_PX = 14; // a smaller outline is drawn as a dot
 const NEAR_PX = 12;
-const LETTER_PX = 7;
+const LETTER_PX = 8;
 const ZOOM_PX = 60; // the buttons at the right border
 const MIN_DEG = 0.0005; // of what is shown, about 50 m
 const GRID_PX = 140; // at least, between lines of the grid
