@@ -361,6 +361,15 @@ def test_a_slow_card_draws_fewer_pixels_while_the_view_moves(
     assert min(widths) == pytest.approx(whole / 2, abs=1)
     drawn(browser)
     assert browser.run(f"{CANVAS}.width") == whole
+    browser.click("Add view")
+    browser.mouse(600, 400, to=(700, 400))
+    browser.click("Add view")
+    drawn(browser)
+    with browser.page.expect_download(timeout=60_000):  # but a film is sharp
+        browser.click("Record")
+        for _ in range(20):
+            browser.run("new Promise(r => setTimeout(r, 100))")
+            assert browser.run(f"{CANVAS}.width") == whole
 
 
 def test_what_changes_while_the_graphics_card_is_busy_is_drawn(

@@ -63,6 +63,7 @@ async function film(stage: Stage, views: View[], each_s: number): Promise<Blob> 
   const stopped = new Promise<void>((resolve) => (recorder.onstop = () => resolve()));
   stage.follow = false;
   stage.controls.enabled = false;
+  stage.painter.isFilmed = true; // else a slow card's film would be as coarse as its view while it moves
   const whole_ms = 1000 * each_s * (views.length - 1);
   const began = performance.now();
   recorder.start();
@@ -81,6 +82,7 @@ async function film(stage: Stage, views: View[], each_s: number): Promise<Blob> 
   await new Promise((resolve) => setTimeout(resolve, 1000 / FRAMES_PER_S));
   recorder.stop();
   stage.controls.enabled = true;
+  stage.painter.isFilmed = false;
   await stopped;
   for (const track of stream.getTracks()) track.stop(); // it would read every later frame too
   return new Blob(parts, { type });

@@ -46,6 +46,8 @@ interface Work {
 export class Painter {
   /** Draw all points in every frame, however long it takes. */
   fullDetail = false;
+  /** Draw with all pixels of the screen in every frame. */
+  isFilmed = false;
   effects: Effects | null = null;
   frames_per_s = 0;
   /** Share of the points that the frame shows so far. */
@@ -108,7 +110,7 @@ export class Painter {
   /** Sets how many pixels the frame has; true when it has all. */
   private sharpen(still: boolean): boolean {
     this.ratio ||= this.renderer.getPixelRatio();
-    const isWhole = still || this.fullDetail || this.effects !== null || this.renderer.xr.isPresenting || this.gradual?.isAdditive;
+    const isWhole = still || this.fullDetail || this.isFilmed || this.effects !== null || this.renderer.xr.isPresenting || this.gradual?.isAdditive;
     const share = isWhole ? 1 : BLURRED[this.blur]!;
     if (this.renderer.getPixelRatio() !== this.ratio * share) this.renderer.setPixelRatio(this.ratio * share);
     return share === 1;
