@@ -79,6 +79,7 @@ ROWS: tuple[Row, ...] = (
     Row("recover", "closes what a crash left open", 5),
     Row("housekeeping", "watches the machine, its memory and its disk", 5),
     Row("first beats", "heartbeats while the rest loads", 6, starts_itself=_BELOW),
+    Row("stand-in", "process: heartbeats where ours are late", 6, starts_itself=_BELOW),
     Row("mavlink", "vehicle, heartbeat, reader and writer of each link", 6, starts_itself=_BELOW),
     Row("health", "/healthz, /status and /metrics; a thread a request", 7, 32, "refuse"),
     Row("simulated flight", "process: camera and autopilot of sim:", 8, restarts=True),

@@ -37,6 +37,7 @@ from mavlink.wire.framing import Packet
 from mavlink.wire.link import Job, Link, LinkInbox, parse_link
 from mavlink.wire.messages import LinkReport, Links, OutgoingMessage
 from mavlink.wire.signing import UNIT_PER_S, Signing, fingerprint, read_key
+from mavlink.wire.stand_in import NICE, StandIn
 from mavlink.wire.tlog import TlogRecorder
 
 log = logging.getLogger(__name__)
@@ -47,7 +48,6 @@ TELEMETRY = numbers_of(READERS)
 STUCK_NS = 10 * S
 WAIT_S = 0.5  # of the disk's thread for work
 TUNNEL_ROOM = 128
-BEAT_NICE = -10  # needs LimitNICE or root, otherwise the priority stays normal
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +62,7 @@ class VehicleConfig:
     odometry: bool = False  # send our motion estimate to the autopilot
     state_dir: Path | None = None  # keeps parameters, signing time and the vehicle's system id
     backlog: int = 10_000  # packets queued for the protocol's thread, and for the disk's
+    stand_in: bool = False  # another process sends heartbeats where ours are late
     close_s: float = 5.0  # that the end of a log waits for a disk at most
 
     def __post_init__(self) -> None:
@@ -126,6 +127,9 @@ class VehicleLink:
         self._threads: list[threading.Thread] = []
         self._alive_ns = now_ns
         opened = links or [Link(parse_link(text)) for text in config.links]
+        self._stand_in = None if first is None else first.stand_in
+        if self._stand_in is None and config.stand_in and config.links:
+            self._stand_in = StandIn()
         sequence = 0 if first is None else first.sequence
         self._links = Links(opened, self._on_packet, self.signing, sequence)
 
@@ -153,6 +157,8 @@ class VehicleLink:
             inbox.put(lambda: None)
         for thread in self._threads:
             thread.join(timeout=5.0)
+        if self._stand_in is not None:
+            self._stand_in.close()
         self._links.stop()
         self._flush(0.0)
         self.recorder.close()
@@ -303,13 +309,22 @@ class VehicleLink:
         """The heartbeats' thread, with raised priority where the system permits it."""
         if sys.platform == "linux":
             with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BEAT_NICE)
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         while not self._stop.is_set():
             now_ns = self._clock_ns()
             due = self.presence.due(now_ns)
             if now_ns - self._alive_ns < STUCK_NS:  # otherwise nothing would answer: stay silent
-                self._record(self._links.send(self.presence.system, due), now_ns)
+                self._send_beats(due, now_ns)
             self._stop.wait(max(0.001, (self.presence.next_ns - self._clock_ns()) / S))
+
+    def _send_beats(self, beats: list[OutgoingMessage], now_ns: int) -> None:
+        """Send heartbeats that are due, and plan the next ones."""
+        system, stand_in = self.presence.system, self._stand_in
+        if beats and stand_in is not None:
+            self._links.skip(stand_in.sent())
+        self._record(self._links.send(system, beats), now_ns)
+        if beats and stand_in is not None:
+            stand_in.plan(self._links.ahead(system, beats, time.monotonic()))
 
     def _send(self, messages: list[OutgoingMessage]) -> None:
         if messages:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mavlink.wire.link import Link, parse_link
+from mavlink.wire.stand_in import AFTER_S, Beat, StandIn
 
 ONBOARD = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 CAMERA = 100  # MAV_COMP_ID_CAMERA
@@ -68,6 +69,7 @@ class FirstBeats:
         self.sequence = 0  # of the next packet of either component
         self.next_s = time.monotonic()
         self.links = [Link(parse_link(text)) for text in links]
+        self.stand_in: StandIn | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="first beats", daemon=True)
 
@@ -75,9 +77,10 @@ class FirstBeats:
         for link in self.links:
             link.start()
         self._thread.start()
+        self.stand_in = StandIn()
 
     def hand_over(self) -> list[Link]:
-        """The open links; from now on the caller sends the heartbeats."""
+        """The open links; from now on the caller sends the heartbeats, and owns the stand-in."""
         self._stop.set()
         self._thread.join()
         return self.links
@@ -85,10 +88,27 @@ class FirstBeats:
     def _run(self) -> None:
         end_s = self.next_s + LONGEST_S
         while not self._stop.is_set() and time.monotonic() < end_s:
-            for component in TYPES:
-                packet = heartbeat_packet(self.sequence, self.system, component, self.token)
+            if self.stand_in is not None:
+                self.sequence += self.stand_in.sent()
+            for packet in self._packets(0):
                 for link in self.links:
                     link.write(packet)
             self.sequence = (self.sequence + 1) & 0xFF
-            self.next_s += PERIOD_S
+            if self.stand_in is not None:
+                self.stand_in.plan(self._ahead(time.monotonic()))
+            self.next_s = max(self.next_s + PERIOD_S, time.monotonic())
             self._stop.wait(max(0.0, self.next_s - time.monotonic()))
+
+    def _packets(self, ahead: int) -> list[bytes]:
+        """A heartbeat of each component, as after so many others."""
+        return [
+            heartbeat_packet(self.sequence + ahead, self.system, component, self.token)
+            for component in TYPES
+        ]
+
+    def _ahead(self, now_s: float) -> list[Beat]:
+        ways = [way for link in self.links for way in link.ways]
+        return [
+            (now_s + after_s, [(way, packet) for way in ways for packet in self._packets(ahead)])
+            for ahead, after_s in enumerate(AFTER_S)
+        ]

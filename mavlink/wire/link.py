@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from mavlink.wire.ports import PORTS, LinkSpec, Port, parse_link
+from mavlink.wire.stand_in import Way
 
 __all__ = ["Link", "LinkSpec", "parse_link"]
 
@@ -49,6 +50,14 @@ class Link:
     @property
     def is_up(self) -> bool:
         return self._port is not None
+
+    @property
+    def ways(self) -> list[Way]:
+        """To everyone at the other end, for another process; none while it is down."""
+        port = self._port
+        with contextlib.suppress(OSError):  # it is being closed
+            return [] if port is None else port.ways
+        return []
 
     def start(self) -> None:
         if self._threads:

@@ -16,6 +16,7 @@ from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer, Packet
 from mavlink.wire.link import Link
 from mavlink.wire.signing import Signing
+from mavlink.wire.stand_in import AFTER_S, Beat
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +65,13 @@ class Packer:
         self._lock = threading.Lock()
         self._encoders: dict[tuple[int, int], Any] = {}
 
-    def pack(self, system: int, outgoing: OutgoingMessage, unix_ns: int) -> bytes | None:
-        """The packet; None when a value does not fit its field."""
+    def pack(
+        self, system: int, outgoing: OutgoingMessage, unix_ns: int, ahead: int | None = None
+    ) -> bytes | None:
+        """The packet; None when a value does not fit its field.
+
+        One that is packed ``ahead``, as after so many others, may never be sent.
+        """
         with self._lock:
             key = (system, outgoing.component)
             encoder = self._encoders.get(key)
@@ -73,14 +79,24 @@ class Packer:
                 encoder = self._encoders[key] = dialect.MAVLink(None, *key)
                 encoder.seq = self._sequence
             if self._signing is not None:
-                self._signing.prepare(encoder, self._link, unix_ns)
+                self._signing.prepare(encoder, self._link, unix_ns, ahead is not None)
+            sequence = encoder.seq
+            encoder.seq = (sequence + (ahead or 0)) % 256
             try:
                 data = bytes(outgoing.message.pack(encoder))
             except (struct.error, ValueError, TypeError, OverflowError) as error:
                 log.error("%s cannot be sent: %s", outgoing.message.get_type(), error)
                 return None
-            encoder.seq = (encoder.seq + 1) % 256
+            finally:
+                encoder.seq = sequence
+            encoder.seq = (sequence + (ahead is None)) % 256
             return data
+
+    def skip(self, packets: int) -> None:
+        """Another process has sent so many packets of each component."""
+        with self._lock:
+            for encoder in self._encoders.values():
+                encoder.seq = (encoder.seq + packets) % 256
 
 
 MAX_SUBSCRIBERS = 16  # of one message; the oldest makes room
@@ -172,6 +188,26 @@ class Links:
                     link.write(data)
                     sent.append(data)
         return sent
+
+    def ahead(self, system: int, messages: Sequence[OutgoingMessage], now_s: float) -> list[Beat]:
+        """For a stand-in: the messages on all links, and again, each at its time after now."""
+        beats: list[Beat] = []
+        for ahead, after_s in enumerate(AFTER_S):
+            unix_ns = time.time_ns() + round(1e9 * after_s)
+            sent = [
+                (way, data)
+                for link, packer in zip(self._links, self._packers, strict=True)
+                for way in link.ways
+                for outgoing in messages
+                if (data := packer.pack(system, outgoing, unix_ns, ahead)) is not None
+            ]
+            beats.append((now_s + after_s, sent))
+        return beats
+
+    def skip(self, packets: int) -> None:
+        """Another process has sent so many packets of each component on each link."""
+        for packer in self._packers:
+            packer.skip(packets)
 
     def report(self) -> tuple[LinkReport, ...]:
         return tuple(

@@ -17,6 +17,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from mavlink.wire.stand_in import Way
+
 READ_S = 0.2  # how long a read may block
 LONGEST = 65536
 PEER_NS = 60_000_000_000  # a UDP peer not heard for longer is forgotten
@@ -65,6 +67,10 @@ class Port(Protocol):
     def write(self, data: bytes) -> None:
         """Send to everyone at the other end."""
 
+    @property
+    def ways(self) -> list[Way]:
+        """To everyone at the other end, for another process."""
+
     def close(self) -> None:
         """Release it."""
 
@@ -94,6 +100,10 @@ class SerialPort:
             self._line.write(data)
         except TypeError as error:
             raise OSError("closed") from error
+
+    @property
+    def ways(self) -> list[Way]:
+        return [(self._line.fileno(), None)]
 
     def close(self) -> None:
         self._line.close()
@@ -138,9 +148,17 @@ class UdpPort:
         for peer, heard in list(self._peers.items()):
             if now - heard > PEER_NS:
                 self._peers.pop(peer, None)
-        for peer in [self._fixed] if self._fixed else list(self._peers):
+        for peer in self._targets:
             with contextlib.suppress(OSError):
                 self._socket.sendto(data, peer)
+
+    @property
+    def _targets(self) -> list[tuple[str, int]]:
+        return list(self._peers) if self._fixed is None else [self._fixed]
+
+    @property
+    def ways(self) -> list[Way]:
+        return [(self._socket.fileno(), peer) for peer in self._targets]
 
     def close(self) -> None:
         self._socket.close()
@@ -182,6 +200,10 @@ class TcpPort:
                 peer.sendall(data)
             except OSError as error:
                 self._lose(peer, error)
+
+    @property
+    def ways(self) -> list[Way]:
+        return [(peer.fileno(), None) for peer in list(self._peers)]
 
     def _accept(self, server: socket.socket) -> None:
         client, _ = server.accept()
@@ -232,6 +254,10 @@ class LinesPort(UdpPort):
 
     def write(self, data: bytes) -> None:
         """Drop it: nothing at the other end reads MAVLink."""
+
+    @property
+    def ways(self) -> list[Way]:
+        return []
 
 
 PORTS: dict[str, Callable[[LinkSpec], Port]] = {

@@ -73,12 +73,13 @@ class Signing:
         with self._lock:
             return dict(self._streams)
 
-    def prepare(self, encoder: Any, link: int, unix_ns: int) -> None:
+    def prepare(self, encoder: Any, link: int, unix_ns: int, is_ahead: bool = False) -> None:
         """Let an encoder of pymavlink sign its next packet; times increase strictly even when the
-        clock steps back."""
+        clock steps back. One ``is_ahead`` may never be sent, and others are sent before."""
         with self._lock:
-            self.timestamp = min(LARGEST, max(self.timestamp + 1, timestamp_of(unix_ns)))
-            encoder.signing.timestamp = self.timestamp
+            timestamp = min(LARGEST, max(self.timestamp + 1, timestamp_of(unix_ns)))
+            self.timestamp = self.timestamp if is_ahead else timestamp
+            encoder.signing.timestamp = timestamp
         encoder.signing.secret_key, encoder.signing.link_id = self._key, link & 0xFF
         encoder.signing.sign_outgoing = True
 

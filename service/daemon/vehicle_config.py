@@ -39,6 +39,7 @@ def vehicle_config(config: Config) -> VehicleConfig:
             signing_key=key,
             odometry=mavlink.odometry,
             state_dir=Path(mavlink.memory or config.scan.folder),
+            stand_in=True,
         )
     except ValueError as error:
         raise InputError(f"[mavlink] {error}") from error

@@ -172,6 +172,7 @@ OUTSIDE = {
     "mavlink/component/vehicle.py": "mavlink knows nothing of service; rows by name",
     "mavlink/wire/link.py": "the same",
     "mavlink/wire/first_beat.py": "the same",
+    "mavlink/wire/stand_in.py": "the same",
 }
 """Where a thread or process starts without the table, and why."""
 

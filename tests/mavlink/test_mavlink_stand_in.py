@@ -1,0 +1,145 @@
+"""Heartbeats go on while a thread keeps the interpreter's lock, and end with the service."""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil  # type: ignore[import-untyped]
+import pytest
+from loopback import until
+from rehearsal import RehearsalControl
+
+from mavlink.component.presence import Health
+from mavlink.component.vehicle import VehicleConfig, VehicleLink
+from mavlink.wire.first_beat import FirstBeats
+from mavlink.wire.framing import Framer, Packet
+from mavlink.wire.signing import Signing
+from mavlink.wire.stand_in import StandIn
+
+SO_TIMESTAMPNS = 35
+HELD_S = 3.0
+usleep = ctypes.PyDLL(None).usleep  # a PyDLL's call keeps the interpreter's lock
+
+
+class Ear:
+    """Hears heartbeats, with the kernel's time of each."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(20.0)
+        self.link = f"udpout:127.0.0.1:{self.socket.getsockname()[1]}"
+        self._framer = Framer()
+
+    def heard(self, until_: Callable[[list[tuple[float, Packet]]], bool]) -> list[Packet]:
+        """The companion's heartbeats until those satisfy a condition."""
+        found: list[tuple[float, Packet]] = []
+        while not until_(found):
+            data, ((_, _, stamp), *_), _, _ = self.socket.recvmsg(65536, 64)
+            seconds, nanoseconds = struct.unpack("@qq", stamp)
+            for packet in self._framer.feed(data):
+                if (packet.message_id, packet.component) == (0, 191):
+                    found.append((seconds + 1e-9 * nanoseconds, packet))
+        return [packet for _, packet in found]
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+@pytest.fixture
+def ear() -> Iterator[Ear]:
+    ear = Ear()
+    yield ear
+    ear.close()
+
+
+def heard_while_the_lock_is_held(ear: Ear) -> tuple[list[Packet], list[Packet]]:
+    """Those that came meanwhile, and all up to one that came later."""
+    during: list[Packet] = []
+    ear.heard(lambda found: len(found) > 2)  # the port was open at the second
+    usleep(round(1e6 * HELD_S))
+    free_s = time.time()
+
+    def is_over(found: list[tuple[float, Packet]]) -> bool:
+        during[:] = [packet for at_s, packet in found if at_s < free_s]
+        return len(found) > len(during)
+
+    return during, ear.heard(is_over)
+
+
+@pytest.mark.parametrize("is_signed", [False, True])
+def test_heartbeats_go_on_while_a_thread_keeps_the_lock(
+    ear: Ear, is_signed: bool, tmp_path: Path
+) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    key.chmod(0o600)
+    config = VehicleConfig((ear.link,), signing_key=key if is_signed else None, stand_in=True)
+    link = VehicleLink(config, RehearsalControl())
+    link.set_health(Health.ACTIVE)
+    link.start()
+    try:
+        during, all_ = heard_while_the_lock_is_held(ear)
+    finally:
+        link.stop()
+    assert 0 < len(during)
+    assert all_[-1].data[4] > during[-1].data[4]  # ours count what it has sent
+    if is_signed:
+        hearer = Signing(bytes(range(32)))
+        assert all(hearer.accepts(packet) for packet in all_)
+
+
+def test_the_first_heartbeats_go_on_too(ear: Ear) -> None:
+    first = FirstBeats((ear.link,), 1, 4711)
+    first.start()
+    assert until(lambda: first.stand_in is not None)
+    try:
+        during, all_ = heard_while_the_lock_is_held(ear)
+    finally:
+        first.hand_over()
+        assert first.stand_in is not None
+        first.stand_in.close()
+    assert 0 < len(during)
+    assert all_[-1].data[4] > during[-1].data[4]
+
+
+def test_a_newer_plan_replaces_one_and_the_process_ends_with_its_owner(ear: Ear) -> None:
+    before = set(psutil.Process().children())
+    stand_in = StandIn()
+    (process,) = set(psutil.Process().children()) - before
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mouth, socket.socketpair()[0] as end:
+        to = ("127.0.0.1", int(ear.link.rpartition(":")[2]))
+        way = mouth.fileno(), to
+        far = time.monotonic() + 600.0
+        stand_in.plan([(0.0, [((-1, to), b"closed"), (way, b"a")]), (far, [(way, b"b")])])
+        assert until(lambda: stand_in.sent() == 1)
+        stand_in.plan([(0.0, [(way, b"c")])])
+        assert until(lambda: stand_in.sent() == 1)
+        stand_in.plan([(far, [((end.fileno(), None), b"d")])])
+    heard = [ear.socket.recv(10) for _ in range(2)]
+    assert heard == [b"a", b"c"]
+    stand_in.close()
+    assert not process.is_running()
+    stand_in.plan([(0.0, [])])  # says nothing: it has ended
+    assert stand_in.sent() == 0
+
+
+def test_a_service_that_stops_planning_falls_silent(ear: Ear) -> None:
+    stand_in = StandIn()
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mouth:
+            way = mouth.fileno(), ("127.0.0.1", int(ear.link.rpartition(":")[2]))
+            stand_in.plan([(0.0, [(way, bytes([n]))]) for n in range(3)])
+            sent = 0
+            while sent < 3:
+                sent += stand_in.sent()
+            mouth.sendto(b"end", way[1])
+        assert [ear.socket.recv(10) for _ in range(4)] == [b"\0", b"\1", b"\2", b"end"]
+    finally:
+        stand_in.close()
