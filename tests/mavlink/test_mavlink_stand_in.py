@@ -88,7 +88,7 @@ def test_heartbeats_go_on_while_a_thread_keeps_the_lock(
         during, all_ = heard_while_the_lock_is_held(ear)
     finally:
         link.stop()
-    assert 0 < len(during)
+    assert len(during) > 0
     assert all_[-1].data[4] > during[-1].data[4]  # ours count what it has sent
     if is_signed:
         hearer = Signing(bytes(range(32)))
@@ -105,7 +105,7 @@ def test_the_first_heartbeats_go_on_too(ear: Ear) -> None:
         first.hand_over()
         assert first.stand_in is not None
         first.stand_in.close()
-    assert 0 < len(during)
+    assert len(during) > 0
     assert all_[-1].data[4] > during[-1].data[4]
 
 
