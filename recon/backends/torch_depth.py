@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,14 @@ from recon.backends.triton_dense import (
     stereo,
 )
 from recon.stereo.exposure import equalised
-from recon.stereo.reprojection import LABEL_SIGMA_PX
+from recon.stereo.reprojection import (
+    LABEL_SIGMA_PX,
+    MAX_NOISE,
+    MIN_COMMON,
+    MIN_NOISE,
+    NOISE_STRIDE,
+    PAIRS_CORRELATION,
+)
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
 from recon.stereo.upsampling import MIN_CONFIDENCE, UpsamplingConfig
 from recon.types import F64, Array, DepthMap, StereoPair
@@ -68,7 +76,12 @@ class DensePath:
     def _fusion(self, pairs: int, size_px: tuple[int, int]) -> tuple[Tensor, Plan]:
         """Room for depth and sigma of each pair, (2, P, h, w), and the plan that fuses them."""
         found = torch.zeros((2, pairs, size_px[1], size_px[0]), device=self.device)
-        return found, Plan(self.device, lambda: fuse(found[0], found[1], self.stages.fusion), [])
+
+        def fused() -> tuple[Tensor, Tensor, Tensor]:
+            depth, sigma = found
+            return fuse(depth, sigma * label_noise(depth, sigma), self.stages.fusion)
+
+        return found, Plan(self.device, fused, [])
 
     def _plan(self, pair: StereoPair, size_px: tuple[int, int]) -> Plan:
         h, w = pair.left.shape
@@ -111,6 +124,25 @@ def pair_depth(
     else:
         sizes = torch.cat([true[:2], true[:2]])
     return reproject(px, confidence, geometry, sizes, size_px, MIN_REPROJECTED)
+
+
+def label_noise(depth: Tensor, sigma: Tensor) -> Tensor:
+    """As :func:`recon.stereo.reprojection.label_noise` of pairs (P, h, w), a number on the device,
+    for which no thread waits; 1 where too few pairs show it."""
+    if len(depth) < 2:
+        return torch.ones((), device=depth.device)
+    inverse = 1.0 / depth[:, ::NOISE_STRIDE, ::NOISE_STRIDE]
+    error = sigma[:, ::NOISE_STRIDE, ::NOISE_STRIDE] * inverse * inverse
+    squares, known = torch.zeros((2, 1), device=depth.device)
+    for i, j in combinations(range(len(depth)), 2):
+        apart = ((inverse[i] - inverse[j]).abs() / torch.hypot(error[i], error[j])).reshape(1, -1)
+        apart = torch.where(apart.isfinite(), apart, torch.nan)
+        enough = (apart == apart).sum() >= MIN_COMMON
+        middle = apart.nanmedian(dim=1).values / 0.6745
+        squares = squares + torch.where(enough, middle * middle, 0.0)
+        known = known + enough
+    noise = (squares / known.clamp(min=1) / (1.0 - PAIRS_CORRELATION)).sqrt()
+    return torch.where(known > 0, noise.clamp(MIN_NOISE, MAX_NOISE), 1.0)
 
 
 def device_inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:

@@ -147,9 +147,7 @@ class Mapper:
         trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, backend, self.rejected, timing)
-        self.surface = SurfaceMap(
-            float(camera.K[0, 0]), trajectory.similarities, config.resolution_m, new_map
-        )
+        self.surface = SurfaceMap(trajectory.similarities, config.resolution_m, new_map)
         self.exposure = ExposureCompensation()
         self.frames = FramePoses(self.keyframes, self.is_settled)
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None

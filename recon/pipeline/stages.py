@@ -19,7 +19,7 @@ from recon.posegraph.segments import Segments
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
-from recon.stereo.reprojection import PairDepth, carry, fuse, plausible, reproject
+from recon.stereo.reprojection import PairDepth, carry, fuse, label_noise, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
 from recon.tracking.frame import Frame
 from recon.tracking.matching import build_pyramid
@@ -97,6 +97,7 @@ class DenseStereo:
         self._backend, self._config, self._dense = backend, config, dense
         self._rejected, self._debug, self._timing = rejected, debug, timing
         self._relief_m = (0.0, 0.0)
+        self._noise = 1.0  # of labels, as the last view with several pairs showed
         self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
         self.pairs = 0
 
@@ -119,7 +120,9 @@ class DenseStereo:
                 depths[partner] = self._reprojected(disparity, pair, K, size_px)  # Eq. 3
             self.keep(view.seq, depths)
             with self._timing("fuse"):
-                depth = fuse([*depths.values()], K, T_odom_camera, self._dense.fusion)
+                found = [*depths.values()]
+                self._noise = label_noise(found) or self._noise
+                depth = fuse(found, K, T_odom_camera, self._dense.fusion, self._noise)
         bgr = cv2.resize(at_middle_row(view.image, view.bgr), size_px, interpolation=cv2.INTER_AREA)
         return depth, np.asarray(bgr, np.uint8)
 

@@ -10,13 +10,7 @@ import numpy as np
 
 from recon.mapping.disagreement import Disagreement
 from recon.mapping.voxel_map import VoxelMap
-from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import F32, F64, Bool, DepthMap
-
-RECORDED_SIGMA_PX = 0.11
-"""Sigma of a match, in pixels of the recording: where stereo's pixels are as small, its labels are
-no better (docs/reports/simulated-flights.md)."""
-
 
 class SurfaceMap:
     """Compares each view with the surface known before, and remembers it.
@@ -26,15 +20,13 @@ class SurfaceMap:
 
     def __init__(
         self,
-        focal_px: float,
         placed: Callable[[Sequence[int]], F64],
         resolution_m: float = 0.0,
         new_map: Callable[[float], VoxelMap] = VoxelMap,
     ) -> None:
-        """``focal_px`` is of the recorded images, ``placed`` as
-        :meth:`recon.posegraph.trajectory.Trajectory.similarities`; ``new_map`` makes the empty
-        map of a scan."""
-        self._focal_px, self._resolution_m, self._new_map = focal_px, resolution_m, new_map
+        """``placed`` as :meth:`recon.posegraph.trajectory.Trajectory.similarities`; ``new_map``
+        makes the empty map of a scan."""
+        self._resolution_m, self._new_map = resolution_m, new_map
         self.known: VoxelMap | None = None
         self._disagreement, self._segment = Disagreement(placed), -1
 
@@ -68,11 +60,9 @@ class SurfaceMap:
         return in_odom.sigma_m, fresh
 
     def _in_odom(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> DepthMap:
-        """The depth at its place, its sigma widened by what the recording and its rows limit."""
-        reduced = self._focal_px / float(depth.K[0, 0])
-        noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
+        """The depth at its place, its sigma widened by what its rows limit."""
         share = cv2.resize(rows_share, depth.depth_m.shape[::-1])
-        sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
+        sigma_m = np.hypot(depth.sigma_m, share * depth.depth_m)
         return replace(depth, sigma_m=sigma_m, T_world_camera=T_odom_camera)
 
     def _empty(self, depth: DepthMap) -> VoxelMap:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import cv2
@@ -14,7 +15,8 @@ from recon.parallel import parallel_for
 from recon.types import F32, F64, Bool, DepthMap, DisparityMap, PosePrior, StereoPair
 
 LABEL_SIGMA_PX = 0.075
-"""Sigma of a label of full confidence, in pixels of the grid that was matched."""
+"""Usual sigma of a label of full confidence, in pixels of the grid that was matched;
+:func:`label_noise` measures what it is."""
 
 MIN_CONFIDENCE = 0.05
 """A label with a lower confidence is not used."""
@@ -202,19 +204,59 @@ class DepthFusionConfig:
     min_sigma_share: float = 0.0005  # of the depth; no pair is better than this
 
 
+NOISE_STRIDE, MIN_COMMON = 3, 500
+"""Pixels from one sample of two pairs' difference to the next, and samples that two pairs share at
+least."""
+
+PAIRS_CORRELATION = 0.15
+"""Correlation of the errors of two pairs of a view: they share its image. Measured on simulated
+flights at crf 18 and 32 (docs/reports/simulated-flights.md)."""
+
+MIN_NOISE, MAX_NOISE = 0.5, 8.0
+"""Noise of labels over the usual one: less is a common error that no pair shows; more is no match."""
+
+
+def label_noise(pairs: Sequence[PairDepth]) -> float | None:
+    """Sigma of labels over the usual one, as the pairs of one view show; None where too few do.
+
+    It is the square root of the variance factor (Mikhail and Ackermann, Observations and Least
+    Squares, 1976): how far pairs disagree over what their sigmas let expect. Clear images match
+    better than usual, and what an encoder smears or drops matches several times worse.
+    """
+    inverse = [1.0 / pair.depth_m[::NOISE_STRIDE, ::NOISE_STRIDE] for pair in pairs]
+    sigma = [
+        pair.sigma_m[::NOISE_STRIDE, ::NOISE_STRIDE] * w * w
+        for pair, w in zip(pairs, inverse, strict=True)
+    ]
+    squares = []
+    for i, j in combinations(range(len(pairs)), 2):
+        apart = np.abs(inverse[i] - inverse[j]) / np.hypot(sigma[i], sigma[j])
+        apart = apart[np.isfinite(apart)]
+        if len(apart) >= MIN_COMMON:
+            squares.append((float(np.median(apart)) / 0.6745) ** 2)
+    if not squares:
+        return None
+    noise = np.sqrt(np.mean(squares) / (1.0 - PAIRS_CORRELATION))
+    return float(np.clip(noise, MIN_NOISE, MAX_NOISE))
+
+
 def fuse(
-    pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: DepthFusionConfig
+    pairs: Sequence[PairDepth],
+    K: F64,
+    T_world_camera: F64,
+    config: DepthFusionConfig,
+    noise: float = 1.0,
 ) -> DepthMap:
     """One depth map of all pairs: at each pixel the largest group that agrees, averaged.
 
-    The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;
+    ``noise`` multiplies all sigmas. The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;
     the sigma is the larger of the propagated one and the spread inside the group. ``views``
     counts the group. Where several pairs read and none comes within ``max_sigma_share`` of
     another nothing is known. Where that is so at more pixels than those at which two agree, what
     they see is not a rigid surface, or their motion is false, and the whole map is unknown.
     """
     depth = np.stack([p.depth_m for p in pairs])
-    sigma = np.stack([p.sigma_m for p in pairs])
+    sigma = np.float32(noise) * np.stack([p.sigma_m for p in pairs])
     shape = depth.shape[1:]
     out = DepthMap(
         np.empty(shape, np.float32), np.empty(shape, np.float32), np.zeros(shape, np.uint8), K,

@@ -22,6 +22,7 @@ from recon.stereo import belief_propagation as compiled
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import MIN_CONFIDENCE, DepthFusionConfig, PairDepth
 from recon.stereo.reprojection import fuse as compiled_fuse
+from recon.stereo.reprojection import label_noise as compiled_noise
 from recon.stereo.reprojection import reproject as compiled_reproject
 from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps
 from recon.stereo.upsampling import upsample as compiled_upsample
@@ -180,6 +181,22 @@ def test_fusion_equals_the_compiled_one(device: str, count: int) -> None:
     np.testing.assert_array_equal(views, want.views)
     np.testing.assert_allclose(depth, want.depth_m, rtol=1e-6)
     np.testing.assert_allclose(sigma, want.sigma_m, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("times", [1, 4])
+def test_noise_of_labels_equals_that_of_the_host(device: str, count: int, times: int) -> None:
+    """Small images share too few pixels: their sigmas stay."""
+    from recon.backends.torch_depth import label_noise
+
+    pairs = [
+        PairDepth(np.tile(d.depth_m, (times, times)), np.tile(d.sigma_m, (times, times)))
+        for d in some_depths(count)
+    ]
+    stacks = np.stack([d.depth_m for d in pairs]), np.stack([d.sigma_m for d in pairs])
+    got = float(label_noise(*on(device, *stacks)).cpu())
+    assert got == pytest.approx(compiled_noise(pairs) or 1.0, rel=3e-3)
+    assert (got != 1.0) == (count > 1 and times > 1)
 
 
 @pytest.mark.parametrize("finer", [1, 3])

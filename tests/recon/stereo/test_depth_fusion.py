@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from recon.stereo.reprojection import DepthFusionConfig, PairDepth, fuse
+from recon.stereo.reprojection import (
+    MAX_NOISE,
+    PAIRS_CORRELATION,
+    DepthFusionConfig,
+    PairDepth,
+    fuse,
+    label_noise,
+)
 from recon.types import F32
 
 K = np.array([[100.0, 0, 39.5], [0, 100.0, 29.5], [0, 0, 1]])
@@ -83,3 +91,39 @@ def test_useless_readings_are_left_out() -> None:
     far = PairDepth(np.full(SHAPE, 60.0, np.float32), np.full(SHAPE, 30.0, np.float32))
     fused = fuse([far], K, np.eye(4), DepthFusionConfig())
     assert np.isnan(fused.depth_m).all()
+
+
+@pytest.mark.parametrize("times", [0.7, 1.0, 3.0])
+def test_noise_of_labels_is_how_far_pairs_of_a_view_disagree(times: float) -> None:
+    """Pairs that err by ``times`` their sigmas, a part of it alike, as they share the view."""
+    rng = np.random.default_rng(5)
+    shape = (180, 320)
+    truth = rng.uniform(40.0, 60.0, shape)
+    shared = rng.normal(0.0, np.sqrt(PAIRS_CORRELATION), shape)
+    own, pairs = np.sqrt(1.0 - PAIRS_CORRELATION), []
+    for sigma in (0.1, 0.2, 0.2, 0.4):
+        error = times * sigma * (shared + rng.normal(0.0, own, shape))
+        pairs.append(
+            PairDepth((truth + error).astype(np.float32), np.full(shape, sigma, np.float32))
+        )
+    pairs[0].depth_m[:, :100] = np.nan
+    pairs[1].depth_m[:20] = 10.0  # wrong matches
+    noise = label_noise(pairs)
+    assert noise == pytest.approx(times, rel=0.1)
+    assert label_noise(pairs[:1]) is None
+    assert label_noise([PairDepth(p.depth_m[:30, :30], p.sigma_m[:30, :30]) for p in pairs]) is None
+    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig(), noise)
+    off = np.abs(fused.depth_m - truth)[20:, 100:]
+    assert 0.6 < np.mean(off <= fused.sigma_m[20:, 100:]) < 0.8
+    assert np.mean(fused.views[20:, 100:] == 4) > 0.9  # right sigmas: none is left out
+
+
+def test_pairs_of_one_false_motion_have_bounded_noise() -> None:
+    rng = np.random.default_rng(6)
+    pairs = [
+        PairDepth(rng.uniform(10, 90, (180, 320)).astype(np.float32), np.full((180, 320), 0.1, "f4"))
+        for _ in range(3)
+    ]
+    assert label_noise(pairs) == MAX_NOISE
+    noisy = fuse(pairs, K, np.eye(4), DepthFusionConfig(), MAX_NOISE)
+    assert np.isnan(noisy.depth_m).all()
