@@ -12,6 +12,7 @@ from recon.mapping.disagreement import Disagreement
 from recon.mapping.voxel_map import VoxelMap
 from recon.types import F32, F64, Bool, DepthMap
 
+
 class SurfaceMap:
     """Compares each view with the surface known before, and remembers it.
 

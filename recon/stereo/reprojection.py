@@ -213,7 +213,7 @@ PAIRS_CORRELATION = 0.15
 flights at crf 18 and 32 (docs/reports/simulated-flights.md)."""
 
 MIN_NOISE, MAX_NOISE = 0.5, 8.0
-"""Noise of labels over the usual one: less is a common error that no pair shows; more is no match."""
+"""Noise of labels over the usual one: with less, pairs share errors; with more, nothing matches."""
 
 
 def label_noise(pairs: Sequence[PairDepth]) -> float | None:
@@ -249,11 +249,12 @@ def fuse(
 ) -> DepthMap:
     """One depth map of all pairs: at each pixel the largest group that agrees, averaged.
 
-    ``noise`` multiplies all sigmas. The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;
-    the sigma is the larger of the propagated one and the spread inside the group. ``views``
-    counts the group. Where several pairs read and none comes within ``max_sigma_share`` of
-    another nothing is known. Where that is so at more pixels than those at which two agree, what
-    they see is not a rigid surface, or their motion is false, and the whole map is unknown.
+    ``noise`` multiplies all sigmas. The mean is over inverse depth (whose error is nearly Gaussian)
+    with weights 1/sigma^2; the sigma is the larger of the propagated one and the spread inside the
+    group. ``views`` counts the group. Where several pairs read and none comes within
+    ``max_sigma_share`` of another nothing is known. Where that is so at more pixels than those at
+    which two agree, what they see is not a rigid surface, or their motion is false, and the whole
+    map is unknown.
     """
     depth = np.stack([p.depth_m for p in pairs])
     sigma = np.float32(noise) * np.stack([p.sigma_m for p in pairs])

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
+import cv2
 import numpy as np
 import pytest
+from painted_ground import SIZE, on_plane, pose, still
+from painted_ground import K as K_IMAGE
+from some_views import view_at
 
+from recon.backends import DenseStages
+from recon.backends.cpu import CpuBackend
+from recon.pipeline.config import untimed
+from recon.pipeline.stages import DenseStereo
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import (
     MAX_NOISE,
     PAIRS_CORRELATION,
@@ -13,6 +25,7 @@ from recon.stereo.reprojection import (
     fuse,
     label_noise,
 )
+from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F32
 
 K = np.array([[100.0, 0, 39.5], [0, 100.0, 29.5], [0, 0, 1]])
@@ -120,10 +133,33 @@ def test_noise_of_labels_is_how_far_pairs_of_a_view_disagree(times: float) -> No
 
 def test_pairs_of_one_false_motion_have_bounded_noise() -> None:
     rng = np.random.default_rng(6)
-    pairs = [
-        PairDepth(rng.uniform(10, 90, (180, 320)).astype(np.float32), np.full((180, 320), 0.1, "f4"))
-        for _ in range(3)
-    ]
+    depths = rng.uniform(10, 90, (3, 180, 320)).astype(np.float32)
+    pairs = [PairDepth(depth, np.full(depth.shape, 0.1, np.float32)) for depth in depths]
     assert label_noise(pairs) == MAX_NOISE
     noisy = fuse(pairs, K, np.eye(4), DepthFusionConfig(), MAX_NOISE)
     assert np.isnan(noisy.depth_m).all()
+
+
+@pytest.mark.parametrize("quality", [95, 15, 5])
+def test_sigma_holds_however_much_the_images_are_compressed(quality: int) -> None:
+    """A tilted camera over painted ground, by four partners whose poses are exact."""
+    images = []
+    for seq, east_m in enumerate((0.0, 4.0, -4.0, 8.0, -8.0)):
+        T = pose(east_m, seed=seq)
+        coded = cv2.imencode(".jpg", still(T), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        gray = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+        bgr = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), np.uint8)
+        images.append(PosedImage(bgr, gray, K_IMAGE, T, seq=seq))
+    T = images[0].T_odom_camera
+    ground = on_plane(K_IMAGE, SIZE, T)[::997]
+    view = view_at(0, T, image=images[0], partners=images[1:], points=ground)
+    dense = DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), DepthFusionConfig())
+    config = VirtualStereoConfig(width_px=240, guided=False)
+    depth, _ = DenseStereo(CpuBackend(), config, dense, Counter(), None, untimed)(view)
+    assert depth is not None
+    truth = on_plane(depth.K, (240, 180), T)[:, 2].reshape(180, 240)
+    known = np.isfinite(depth.depth_m)
+    off = np.abs(depth.depth_m - truth)[known]
+    assert known.mean() > 0.9
+    assert 0.7 < np.mean(off <= depth.sigma_m[known]) < 0.85
+    assert np.mean(off <= 2 * depth.sigma_m[known]) > 0.94
