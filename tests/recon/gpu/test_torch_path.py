@@ -232,7 +232,7 @@ def by_stages(pairs: list[StereoPair], matching: BeliefPropagationConfig) -> Dep
         if pair.guide is not None:
             found = compiled_upsample(found, pair.guide, UpsamplingConfig())
         depths.append(compiled_reproject(found, pair, K, SIZE))
-    return compiled_fuse(depths, K, np.eye(4), ALL)
+    return compiled_fuse(depths, K, np.eye(4), ALL, compiled_noise(depths) or 1.0)
 
 
 def pairs_for(device: str, guide: int) -> list[StereoPair]:
