@@ -1,11 +1,11 @@
 """How much depth images of the same ground disagree, relative to their sigmas.
 
-Stereo knows its own noise. That a lens is not quite as its model says, or that the poses a depth
-image was made with were off, tilts and bows the whole image; only other images of the same ground
-show it, each where the map has it now: what the odometry drifts by until a loop corrects it is no
-error of the map. What they disagree by is the square root of the adjustment's variance factor
-(Mikhail and Ackermann, Observations and Least Squares, 1976), and sigmas are multiplied by it:
-wider in compressed video, narrower in clear images.
+Stereo measures its own noise (:func:`recon.stereo.reprojection.label_noise`). That a lens is not
+quite as its model says, or that the poses a depth image was made with were off, tilts and bows the
+whole image; only other images of the same ground show it, each where the map has it now: what the
+odometry drifts by until a loop corrects it is no error of the map. What they disagree by is the
+square root of the adjustment's variance factor (Mikhail and Ackermann, Observations and Least
+Squares, 1976), and sigmas are multiplied by it.
 """
 
 from __future__ import annotations

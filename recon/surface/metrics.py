@@ -133,8 +133,12 @@ def fit_surface(
 
 
 def _plane_step(p: F64, n: F64, r: F64, w: F64, with_scale: bool) -> F64:
-    """(7,) rotation rad, translation m, log scale that lessen point-to-plane residuals ``r``."""
-    J = np.hstack([np.cross(p, n), n, np.einsum("ni,ni->n", p, n)[:, None]])
+    """(7,) rotation rad, translation m, log scale that lessen point-to-plane residuals ``r``.
+
+    Scale stretches the true surface's height along the normal, which the points' own holds with
+    their noise: by that the scale would be pulled down (Fuller, Measurement Error Models, 1987).
+    """
+    J = np.hstack([np.cross(p, n), n, (np.einsum("ni,ni->n", p, n) - r)[:, None]])
     if not with_scale:
         J = J[:, :6]
     H = (J * w[:, None]).T @ J

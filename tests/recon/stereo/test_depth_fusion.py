@@ -122,7 +122,7 @@ def test_noise_of_labels_is_how_far_pairs_of_a_view_disagree(times: float) -> No
     pairs[0].depth_m[:, :100] = np.nan
     pairs[1].depth_m[:20] = 10.0  # wrong matches
     noise = label_noise(pairs)
-    assert noise == pytest.approx(times, rel=0.1)
+    assert noise is not None and noise == pytest.approx(times, rel=0.1)
     assert label_noise(pairs[:1]) is None
     assert label_noise([PairDepth(p.depth_m[:30, :30], p.sigma_m[:30, :30]) for p in pairs]) is None
     fused = fuse(pairs, K, np.eye(4), DepthFusionConfig(), noise)

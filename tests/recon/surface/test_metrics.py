@@ -92,6 +92,15 @@ def test_surface_fit_finds_the_motion(with_scale: bool, seed: int) -> None:
     assert fit.scale == pytest.approx(scale, abs=2e-3)
 
 
+def test_noise_of_points_does_not_shrink_the_surface() -> None:
+    """Half a metre of scatter would take 4 % off the scale."""
+    surface, rng = relief(), np.random.default_rng(4)
+    places, normals = metrics.sample_surface(surface, 0.3)
+    scan = places + normals * rng.normal(0.0, 0.5, (len(places), 1))
+    fit = metrics.fit_surface(scan, surface, Fit.identity(), with_scale=True)
+    assert fit.scale == pytest.approx(1.0, abs=0.003)
+
+
 def test_surface_errors_of_a_known_offset() -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-40, 40, (4000, 2)), 0.2 + 0.1 * rng.normal(size=4000)])
