@@ -102,6 +102,7 @@ class KeyframeMap:
     def _step(self, view: StereoView, depth: DepthMap | None) -> tuple[F64 | None, F64]:
         """The step (4, 4) from the keyframe before, None where its chain begins, and its covariance
         (6, 6): vision's and ICP's, weighted by covariance; vision's alone where ICP contradicts it.
+        ICP makes it no surer: vision's motion of the same images gave the depth that it aligns.
 
         Lengths are in units of the odometry, the covariance of a left perturbation in the frame of
         the camera before; without a step, of the pose itself.
@@ -118,7 +119,8 @@ class KeyframeMap:
         with self._timing("icp"):
             found = self._backend.register(depth, self._depth, step, self._icp)
         self.verdicts[found.verdict] += 1
-        return agreed_motion(step, covariance, found) or (step, covariance)
+        agreed = agreed_motion(step, covariance, found)
+        return step if agreed is None else agreed[0], covariance
 
     def predicted(self, view: StereoView) -> tuple[F64, Pose] | None:
         """A view that is not added yet: T_odom_camera (4, 4) in its segment's chain, and its pose
