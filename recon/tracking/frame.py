@@ -1,4 +1,5 @@
-"""A frame on its way through tracking and stereo, and its pose relative to its keyframe."""
+"""A frame on its way through tracking and stereo, its landmarks, and its pose relative to its
+keyframe."""
 
 from __future__ import annotations
 
@@ -7,10 +8,10 @@ from enum import Enum
 
 import numpy as np
 
+from recon import se3
 from recon.rolling_shutter import GLOBAL_SHUTTER, FrameRows
-from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.matching import Pyramid
-from recon.types import F64, U8, PosePrior
+from recon.types import F64, I64, U8, Bool, PosePrior
 
 NO_IMAGE: U8 = np.zeros((0, 0), np.uint8)
 UNKNOWN = PosePrior()
@@ -25,6 +26,60 @@ class Tracking(str, Enum):
     LOST = "lost"
 
 
+class Landmarks:
+    """Points (x, y, z) of one segment by number; a dropped point is NaN.
+
+    Numbers only grow; :meth:`forget_before` frees those that no keyframe refers to.
+    """
+
+    def __init__(self) -> None:
+        self._xyz = np.zeros((0, 3))
+        self._first = 0
+        self._end = 0
+
+    def __len__(self) -> int:
+        return self._end - self._first
+
+    def add(self, points: F64) -> I64:
+        """Enter points (N, 3); returns their (N,) numbers."""
+        need = len(self) + len(points)
+        if need > len(self._xyz):
+            grown = np.full((2 * need, 3), np.nan)
+            grown[: len(self)] = self._xyz[: len(self)]
+            self._xyz = grown
+        self._xyz[len(self) : need] = points
+        numbers = np.arange(self._end, self._end + len(points), dtype=np.int64)
+        self._end += len(points)
+        return numbers
+
+    def __getitem__(self, numbers: I64) -> F64:
+        """(N, 3) points of the (N,) numbers."""
+        return np.asarray(self._xyz[numbers - self._first])
+
+    def __setitem__(self, numbers: I64, points: F64 | float) -> None:
+        self._xyz[numbers - self._first] = points
+
+    def known(self, numbers: I64) -> Bool:
+        """(N,) True for numbers (-1: none) whose point is held and not dropped."""
+        held = numbers >= self._first
+        out = np.zeros(len(numbers), np.bool_)
+        out[held] = np.isfinite(self._xyz[numbers[held] - self._first, 0])
+        return out
+
+    def scale_about(self, origin: F64, factor: float) -> None:
+        """Stretch all points away from ``origin`` (3,) by ``factor``."""
+        self._xyz = origin + (self._xyz - origin) * factor
+
+    def forget_before(self, number: int) -> None:
+        """Free all points with smaller numbers."""
+        gone = min(number, self._end) - self._first
+        if gone > 0:
+            kept = self._xyz[gone : len(self)].copy()
+            self._xyz[: len(kept)] = kept
+            self._xyz[len(kept) :] = np.nan
+            self._first += gone
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
     """A frame's pose relative to a keyframe, whose own pose gets better while it is adjusted.
@@ -35,7 +90,7 @@ class RelativePose:
     seq: int
     segment: int
     T_keyframe_camera: F64  # (4, 4); T_odom_camera without a keyframe
-    keyframe: OdometryKeyframe | None = None
+    keyframe: Frame | None = None
 
     @property
     def T_odom_camera(self) -> F64:
@@ -49,14 +104,14 @@ class RelativePose:
         return RelativePose(self.seq, self.segment, self.T_odom_camera)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Frame:
     """One image of the camera, with what is known of it by now.
 
     The caller gives the image, its time and number, and telemetry; :class:`Undistort` the images
     without distortion; the odometry the rest. A frame with a pose may take part in stereo, as a
-    view or as a view's partner, and its pose follows its odometry keyframe's. Images that are no
-    longer needed are :data:`NO_IMAGE`.
+    view or as a view's partner. Its pose follows that of the odometry's last keyframe, which is a
+    frame whose corners have landmarks. Images that are no longer needed are :data:`NO_IMAGE`.
     """
 
     image: U8  # (H, W, 3) BGR with distortion
@@ -74,6 +129,14 @@ class Frame:
     tracks: int = 0  # corners found
     reason: str = ""  # why it has no pose
     row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known
+    # Of a keyframe, which has no relative pose: its own, refined while it is in the window.
+    T_camera_odom: F64 = field(default_factory=lambda: np.full((4, 4), np.nan))
+    # (6, 6) of the motion from the keyframe before, left of T_camera_before.
+    covariance: F64 = field(default_factory=lambda: np.zeros((6, 6)))
+    uv: F64 = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) corners, as their rows saw
+    # (N,) the corners' numbers in ``landmarks``, which are of the segment; -1: none yet.
+    landmark: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    landmarks: Landmarks = field(default_factory=Landmarks)
 
     @property
     def small(self) -> U8:
@@ -81,7 +144,7 @@ class Frame:
         return self.pyramid[0]
 
     @property
-    def keyframe(self) -> OdometryKeyframe:
+    def keyframe(self) -> Frame:
         assert self.relative is not None, "the frame is not tracked"
         assert self.relative.keyframe is not None, "a frame of stereo is not settled"
         return self.relative.keyframe
@@ -89,5 +152,12 @@ class Frame:
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
-        assert self.relative is not None, "the frame is not tracked"
+        if self.relative is None:
+            return se3.inverse(self.T_camera_odom)
         return self.relative.T_odom_camera
+
+    def known_points(self) -> tuple[Bool, F64]:
+        """(N,) which corners of a keyframe have a landmark, and (M, 3) those in its camera, in
+        odometry units."""
+        known = self.landmarks.known(self.landmark)
+        return known, se3.transform(self.T_camera_odom, self.landmarks[self.landmark[known]])

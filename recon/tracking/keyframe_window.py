@@ -1,111 +1,32 @@
-"""The odometry's keyframes, their landmarks, and the joint adjustment of both."""
+"""The odometry's last keyframes and their landmarks: triangulated, and adjusted together."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from recon import se3
 from recon.rolling_shutter import FrameRows
-from recon.tracking import bundle, matching, two_view
-from recon.types import F64, I64, Bool, PosePrior
+from recon.tracking import bundle, two_view
+from recon.tracking.frame import Frame
+from recon.types import F64, I64, Bool
 
 
-class Landmarks:
-    """Points (x, y, z) of one segment by number; a dropped point is NaN.
-
-    Numbers only grow; :meth:`forget_before` frees those that no keyframe refers to.
-    """
-
-    def __init__(self) -> None:
-        self._xyz = np.full((1024, 3), np.nan)
-        self._first = 0
-        self._end = 0
-
-    def __len__(self) -> int:
-        return self._end - self._first
-
-    def add(self, points: F64) -> I64:
-        """Enter points (N, 3); returns their (N,) numbers."""
-        need = len(self) + len(points)
-        if need > len(self._xyz):
-            grown = np.full((2 * need, 3), np.nan)
-            grown[: len(self)] = self._xyz[: len(self)]
-            self._xyz = grown
-        self._xyz[len(self) : need] = points
-        numbers = np.arange(self._end, self._end + len(points), dtype=np.int64)
-        self._end += len(points)
-        return numbers
-
-    def __getitem__(self, numbers: I64) -> F64:
-        """(N, 3) points of the (N,) numbers."""
-        return np.asarray(self._xyz[numbers - self._first])
-
-    def __setitem__(self, numbers: I64, points: F64 | float) -> None:
-        self._xyz[numbers - self._first] = points
-
-    def known(self, numbers: I64) -> Bool:
-        """(N,) True for numbers (-1: none) whose point is held and not dropped."""
-        held = numbers >= self._first
-        out = np.zeros(len(numbers), np.bool_)
-        out[held] = np.isfinite(self._xyz[numbers[held] - self._first, 0])
-        return out
-
-    def scale_about(self, origin: F64, factor: float) -> None:
-        """Stretch all points away from ``origin`` (3,) by ``factor``."""
-        self._xyz = origin + (self._xyz - origin) * factor
-
-    def forget_before(self, number: int) -> None:
-        """Free all points with smaller numbers."""
-        gone = min(number, self._end) - self._first
-        if gone > 0:
-            kept = self._xyz[gone : len(self)].copy()
-            self._xyz[: len(kept)] = kept
-            self._xyz[len(kept) :] = np.nan
-            self._first += gone
-
-
-@dataclass(slots=True, eq=False)
-class OdometryKeyframe:
-    """A keyframe inside the odometry; its pose is refined while it is in the window."""
-
-    seq: int
-    segment: int
-    T_camera_odom: F64  # (4, 4)
-    covariance: F64  # (6, 6) of the motion from the keyframe before, left of T_camera_before
-    prior: PosePrior
-    pyramid: matching.Pyramid
-    uv: F64  # (N, 2) corners
-    landmark: I64  # (N,) number in ``landmarks``, -1 none yet
-    landmarks: Landmarks  # of its segment, in the odometry's frame
-    row_motion: FrameRows  # its corners lie where their own rows saw them
-
-    @property
-    def T_odom_camera(self) -> F64:
-        return se3.inverse(self.T_camera_odom)
-
-    def known_points(self) -> tuple[Bool, F64]:
-        """(N,) which corners have a landmark, and (M, 3) those in its camera, in odometry units."""
-        known = self.landmarks.known(self.landmark)
-        return known, se3.transform(self.T_camera_odom, self.landmarks[self.landmark[known]])
-
-
-def landmark_points(key: OdometryKeyframe) -> F64:
+def landmark_points(key: Frame) -> F64:
     """(N, 3) points in front of the keyframe's camera, in odometry units."""
     _, P = key.known_points()
     return P[P[:, 2] > 0]
 
 
-def median_depth(key: OdometryKeyframe) -> float:
+def median_depth(key: Frame) -> float:
     """Median depth of the keyframe's landmarks, in odometry units; NaN without any."""
     depth = landmark_points(key)[:, 2]
     return float(np.median(depth)) if depth.size else float("nan")
 
 
 def triangulate(
-    key: OdometryKeyframe,
+    key: Frame,
     T_camera_odom: F64,
     row_motion: FrameRows,
     uv: F64,
@@ -138,7 +59,7 @@ def triangulate(
 
 
 def observations(
-    window: list[OdometryKeyframe], K: F64, views: int, readout_s: float | None = None
+    window: list[Frame], K: F64, views: int, readout_s: float | None = None
 ) -> tuple[I64, I64, I64, F64]:
     """(N,) landmarks that so many ``views`` or more show, and of each of M sightings: which of
     them, in which keyframe, and at which pixel (M, 2) at the middle row's time.
@@ -158,9 +79,7 @@ def observations(
     return ids, index.astype(np.int64), np.concatenate(cam)[use], np.concatenate(uv)[use]
 
 
-def adjust_window(
-    window: list[OdometryKeyframe], K: F64
-) -> tuple[bundle.BundleResult, I64, I64, F64]:
+def adjust_window(window: list[Frame], K: F64) -> tuple[bundle.BundleResult, I64, I64, F64]:
     """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale. The result,
     and of each of M sightings the keyframe, the landmark and the pixel (M, 2)."""
     fixed = 1 if len(window) == 2 else 2
@@ -179,7 +98,7 @@ def adjust_window(
     return result, camera, index, uv_px
 
 
-def step_covariance(keys: Sequence[OdometryKeyframe], T_camera_odom: F64) -> F64:
+def step_covariance(keys: Sequence[Frame], T_camera_odom: F64) -> F64:
     """(6, 6) of a motion over consecutive keyframes, left perturbation at a camera."""
     out = np.zeros((6, 6))
     for key in keys:
@@ -188,12 +107,12 @@ def step_covariance(keys: Sequence[OdometryKeyframe], T_camera_odom: F64) -> F64
     return out
 
 
-def _baseline(window: list[OdometryKeyframe]) -> float:
+def _baseline(window: list[Frame]) -> float:
     moved = window[1].T_camera_odom @ window[0].T_odom_camera
     return float(np.linalg.norm(moved[:3, 3]))
 
 
-def _restore_baseline(window: list[OdometryKeyframe], base: float) -> None:
+def _restore_baseline(window: list[Frame], base: float) -> None:
     """Two views leave the scale open; put it back to where it was."""
     factor = base / max(_baseline(window), 1e-9)
     origin = window[0].T_odom_camera[:3, 3]
@@ -207,9 +126,7 @@ def _restore_baseline(window: list[OdometryKeyframe], base: float) -> None:
     window[1].covariance = across @ window[1].covariance @ across.T  # the baseline is the unit
 
 
-def _drop_outliers(
-    window: list[OdometryKeyframe], ids: I64, index: I64, cam: I64, residual_px: F64
-) -> None:
+def _drop_outliers(window: list[Frame], ids: I64, index: I64, cam: I64, residual_px: F64) -> None:
     """Remove observations far off; a landmark left with one view is dropped."""
     bad = residual_px > max(2.5, 4.0 * float(np.median(residual_px)))
     for c in np.unique(cam[bad]):

@@ -17,7 +17,7 @@ from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.frame import Frame
-from recon.tracking.keyframe_window import OdometryKeyframe, median_depth
+from recon.tracking.keyframe_window import median_depth
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.sift_features import FEATURE_SHARES, FeatureCache, FeatureMatches
 from recon.types import F64, I64, Bool, Camera, PosePrior
@@ -55,7 +55,7 @@ CLEAR_SHARE = 0.6
 class Located:
     """A frame's pose and a keyframe's corners found in it."""
 
-    key: OdometryKeyframe
+    key: Frame
     pose: pnp.PnpResult  # camera from odometry
     uv: F64  # (N, 2) of the keyframe's corners
     ok: Bool  # (N,) found, and not contradicted by the pose
@@ -68,12 +68,12 @@ class Located:
         return int(np.count_nonzero(self.pose.inliers))
 
 
-TwoViewPose = tuple[OdometryKeyframe, F64, F64, Bool]
+TwoViewPose = tuple[Frame, F64, F64, Bool]
 """A frame's pose by what it and one keyframe see, whose depths give the scale: that keyframe,
 T_camera_odom (4, 4), where (N, 2) its corners are found, and which (N,) are."""
 
 
-Start = tuple[OdometryKeyframe, F64, float, bool]
+Start = tuple[Frame, F64, float, bool]
 """Where the camera may be: a keyframe, T_camera_odom (4, 4), the radius about it, as a share of the
 width, in which to search for the keyframe's corners, and whether features leave no doubt about the
 heading."""
@@ -91,7 +91,7 @@ class Localiser:
     def locate(
         self,
         new: Frame,
-        keyframes: Sequence[OdometryKeyframe],
+        keyframes: Sequence[Frame],
         motion: ConstantVelocity,
         low_frame_rate: bool,
         lost: bool,
@@ -121,9 +121,7 @@ class Localiser:
                 break
         return reason if best is None else best
 
-    def others(
-        self, new: Frame, keyframes: Sequence[OdometryKeyframe], found: Located
-    ) -> list[Located]:
+    def others(self, new: Frame, keyframes: Sequence[Frame], found: Located) -> list[Located]:
         """The frame against the other recent keyframes that see the same ground."""
         share, least = 0.5 * SEARCH_SHARE, MIN_TRACKS // 3
         T = found.pose.T_camera_points
@@ -131,7 +129,7 @@ class Localiser:
         located = [self.pose_from(key, new, T, share, least) for key in rest]
         return [other for other in located if not isinstance(other, str)]
 
-    def by_two_views(self, new: Frame, keyframes: Sequence[OdometryKeyframe]) -> TwoViewPose | None:
+    def by_two_views(self, new: Frame, keyframes: Sequence[Frame]) -> TwoViewPose | None:
         """The frame by two views alone: little of what it shares with a keyframe has landmarks.
 
         The scale is that of the keyframe's landmarks, or where none is shared of the ground
@@ -152,9 +150,7 @@ class Localiser:
             key.uv, key.landmark = corners
         return None
 
-    def with_features(
-        self, new: Frame, key: OdometryKeyframe, uv: F64, ok: Bool
-    ) -> tuple[F64, Bool] | None:
+    def with_features(self, new: Frame, key: Frame, uv: F64, ok: Bool) -> tuple[F64, Bool] | None:
         """Where (N, 2) a keyframe's corners are found, and which (N,), once the features that both
         images share are among them; None where they share none.
 
@@ -173,9 +169,7 @@ class Localiser:
         key.landmark = np.concatenate([key.landmark, np.full(count, -1, np.int64)])
         return np.vstack([uv, shared.uv_b[fresh]]), np.concatenate([ok, np.ones(count, np.bool_)])
 
-    def _two_views(
-        self, new: Frame, key: OdometryKeyframe, uv: F64, ok: Bool
-    ) -> TwoViewPose | None:
+    def _two_views(self, new: Frame, key: Frame, uv: F64, ok: Bool) -> TwoViewPose | None:
         """The pose by the keyframe's corners found at ``uv`` (N, 2) where ``ok`` (N,)."""
         if ok.sum() < 2 * MIN_TRACKS:
             return None
@@ -199,7 +193,7 @@ class Localiser:
         return key, step @ key.T_camera_odom, uv, good
 
     def motion_since(
-        self, key: OdometryKeyframe, new: Frame, uv: F64, ok: Bool, inverse_depth: float,
+        self, key: Frame, new: Frame, uv: F64, ok: Bool, inverse_depth: float,
         R_b_a: F64 | None, max_turn_rad: float, may_be_wrong: bool,
     ) -> two_view.TwoView | None:  # fmt: skip
         """The motion since a keyframe, whose corners are at ``uv`` (N, 2) where ``ok`` (N,).
@@ -220,7 +214,7 @@ class Localiser:
     def _starts(
         self,
         new: Frame,
-        keyframes: Sequence[OdometryKeyframe],
+        keyframes: Sequence[Frame],
         motion: ConstantVelocity,
         lost: bool,
     ) -> Iterator[Start]:
@@ -240,7 +234,7 @@ class Localiser:
             yield from self._by_features(new, keyframes, low_frame_rate)
 
     def _by_features(
-        self, new: Frame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
+        self, new: Frame, keyframes: Sequence[Frame], low_frame_rate: bool
     ) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
         for key, shared in self._shared(new, keyframes, low_frame_rate):
@@ -250,8 +244,8 @@ class Localiser:
                     yield key, T_camera_odom, share, True
 
     def _shared(
-        self, new: Frame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
-    ) -> list[tuple[OdometryKeyframe, FeatureMatches]]:
+        self, new: Frame, keyframes: Sequence[Frame], low_frame_rate: bool
+    ) -> list[tuple[Frame, FeatureMatches]]:
         """Recent keyframes that share features with the frame, the most first."""
         here, found = (new.seq, new.small), []
         for key in keyframes[-RECALLED:]:
@@ -261,7 +255,7 @@ class Localiser:
                 found.append((key, shared))
         return sorted(found, key=lambda item: -len(item[1]))
 
-    def _pose_by(self, key: OdometryKeyframe, shared: FeatureMatches) -> F64 | None:
+    def _pose_by(self, key: Frame, shared: FeatureMatches) -> F64 | None:
         """T_camera_odom by the keyframe's landmarks, carried to where ``shared`` says."""
         known = np.flatnonzero(key.landmarks.known(key.landmark))
         there = shared.carry(key.uv[known])
@@ -275,13 +269,13 @@ class Localiser:
 
     def pose_from(
         self,
-        key: OdometryKeyframe,
+        key: Frame,
         new: Frame,
         T_camera_odom: F64,
         share: float,
         least: int,
         most: int | None = None,
-        left: OdometryKeyframe | None = None,
+        left: Frame | None = None,
     ) -> Located | str:
         """Pose of the frame by a keyframe's landmarks, or why there is none.
 
@@ -316,7 +310,7 @@ class Localiser:
 
     def _search(
         self,
-        key: OdometryKeyframe,
+        key: Frame,
         new: Frame,
         T_camera_odom: F64,
         radius_px: float,
@@ -377,9 +371,7 @@ class Localiser:
         middle = row_motion.at_middle(self.camera.K, uv, 1.0 / np.maximum(depth, 1e-6))
         return pnp.solve(points, middle, self.camera.K, start, gate_px)
 
-    def _agrees(
-        self, T_camera_odom: F64, prior: PosePrior, key: OdometryKeyframe, tilt_only: bool
-    ) -> bool:
+    def _agrees(self, T_camera_odom: F64, prior: PosePrior, key: Frame, tilt_only: bool) -> bool:
         """False when vision turned otherwise than telemetry since the keyframe.
 
         ``tilt_only`` where vision is sure of the heading: tags and compasses are often wrong.
@@ -402,7 +394,7 @@ class Localiser:
         self._drift = np.eye(3)
 
     def match_first(
-        self, new: Frame, first: OdometryKeyframe, R_b_a: F64 | None,
+        self, new: Frame, first: Frame, R_b_a: F64 | None,
         low_frame_rate: bool,
     ) -> tuple[F64, Bool]:  # fmt: skip
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame, by what is
@@ -421,7 +413,7 @@ class Localiser:
         return uv, ok
 
     def _guesses(
-        self, new: Frame, first: OdometryKeyframe, R_b_a: F64 | None,
+        self, new: Frame, first: Frame, R_b_a: F64 | None,
         low_frame_rate: bool,
     ) -> Iterator[tuple[F64, F64, float]]:  # fmt: skip
         """Where the corners went, with warps and radius in px, best first."""
@@ -438,7 +430,7 @@ class Localiser:
             for radius_px in self._near_px:
                 yield *guess, radius_px
 
-    def _by_telemetry(self, new: Frame, first: OdometryKeyframe, R_b_a: F64) -> F64:
+    def _by_telemetry(self, new: Frame, first: Frame, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""
         a, b = first.prior, new.prior
         height, t = b.agl_m or 0.0, np.zeros(3)
@@ -449,7 +441,7 @@ class Localiser:
         return np.asarray(K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(K))
 
     def _find(
-        self, key: OdometryKeyframe, new: Frame, uv: F64, warp: F64, radius_px: float
+        self, key: Frame, new: Frame, uv: F64, warp: F64, radius_px: float
     ) -> tuple[F64, Bool]:
         """Where (N, 2) a keyframe's corners are in a frame, about ``uv``, and which are found."""
         found = matching.match(

@@ -19,10 +19,8 @@ from recon import se3
 from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.focal_watch import FocalWatch
-from recon.tracking.frame import Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Landmarks, RelativePose, Tracking
 from recon.tracking.keyframe_window import (
-    Landmarks,
-    OdometryKeyframe,
     adjust_window,
     median_depth,
     triangulate,
@@ -85,7 +83,7 @@ class Odometry:
         self.camera = camera
         self.K = camera.K
         self._base_to_height = base_to_height
-        self.keyframes: list[OdometryKeyframe] = []  # of the current segment
+        self.keyframes: list[Frame] = []  # of the current segment
         self.segment = -1
         self._lost = 0
         self._missed_frame: Frame | None = None  # the last still, where it is lost
@@ -96,7 +94,7 @@ class Odometry:
         clock = self._row_track.clock
         self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
         self.focal, self._watched_seq = FocalWatch(self.K), -1
-        self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
+        self._unsettled: Frame | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self._row_track)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
@@ -223,11 +221,11 @@ class Odometry:
 
     def _keyframe(
         self, new: Frame, T_camera_odom: F64, uv: F64, landmark: I64, table: Landmarks
-    ) -> OdometryKeyframe:
+    ) -> Frame:
         """The frame as a keyframe with corners ``uv`` (N, 2)."""
-        return OdometryKeyframe(
-            new.seq, self.segment, T_camera_odom, np.zeros((6, 6)), new.prior, new.pyramid, uv,
-            landmark, table, new.row_motion,
+        return replace(
+            new, image=NO_IMAGE, gray=NO_IMAGE, mask=None, segment=self.segment,
+            T_camera_odom=T_camera_odom, uv=uv, landmark=landmark, landmarks=table,
         )  # fmt: skip
 
     def _corners(self, new: Frame) -> F64:
@@ -278,7 +276,7 @@ class Odometry:
         off_px = float(self.K[0, 0]) * prediction.beyond_turn(uv_a, uv_b, self.K)
         return off_px > 2.0 * two_view.MAX_ERROR_PX
 
-    def _place_early(self, first: OdometryKeyframe) -> None:
+    def _place_early(self, first: Frame) -> None:
         """Poses of the frames after the first; they say how its rows moved."""
         for row_motion, uv, ok in self._early:
             rows = np.flatnonzero(ok & first.landmarks.known(first.landmark[: len(ok)]))
@@ -341,7 +339,7 @@ class Odometry:
         self,
         new: Frame,
         T_camera_odom: F64,
-        seen: list[tuple[OdometryKeyframe, F64, Bool]],
+        seen: list[tuple[Frame, F64, Bool]],
     ) -> Frame:
         """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window.
 

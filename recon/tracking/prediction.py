@@ -10,7 +10,7 @@ from recon import se3
 from recon.camera_model import rays
 from recon.small_matrices import solve_symmetric
 from recon.tracking import robust_geometry, two_view
-from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.frame import Frame
 from recon.types import F64, I64, Bool, PosePrior
 
 MIN_MEASURED = 12
@@ -67,7 +67,7 @@ def common_affine(uv: F64, there: F64) -> F64:
 
 
 def on_landmarks(
-    key: OdometryKeyframe, K: F64, size_px: tuple[int, int], T_camera_odom: F64
+    key: Frame, K: F64, size_px: tuple[int, int], T_camera_odom: F64
 ) -> tuple[F64, F64, Bool]:
     """Where (N, 2) the keyframe's corners fall for a start pose, the warps (N, 2, 2) of offsets
     there, and which (N,) are visible. Corners without a landmark are taken to lie on the plane
@@ -85,7 +85,7 @@ def on_landmarks(
     return uv, warp, visible
 
 
-def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> F64 | None:
+def landmark_depths(key: Frame, K: F64, rows: I64) -> F64 | None:
     """(N,) depths in its camera of the keyframe's corners ``rows`` (N,), NaN without a landmark.
 
     With too few landmarks among them all depths are those of the plane through the others;

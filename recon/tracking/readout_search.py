@@ -15,7 +15,8 @@ import numpy as np
 
 from recon.rolling_shutter import RowClock
 from recon.tracking import bundle
-from recon.tracking.keyframe_window import OdometryKeyframe, observations
+from recon.tracking.frame import Frame
+from recon.tracking.keyframe_window import observations
 from recon.types import F64
 
 KEYFRAMES, FIRST_KEYFRAMES = 5, 3
@@ -79,7 +80,7 @@ class ReadoutEstimate:
         return is_known and abs(self.readout_s) < GLOBAL_S
 
 
-Cost = Callable[["list[OdometryKeyframe]", float, F64], tuple[float, int]]
+Cost = Callable[["list[Frame]", float, F64], tuple[float, int]]
 """(Keyframes, readout in s, K) to :func:`window_cost`."""
 
 
@@ -109,7 +110,7 @@ class ReadoutSearch:
         off_s = self.estimate.readout_s - self._clock.readout_s
         return min(float(np.hypot(self.estimate.sigma_s, off_s)), USUAL_S)
 
-    def look(self, keyframes: list[OdometryKeyframe]) -> bool:
+    def look(self, keyframes: list[Frame]) -> bool:
         """Search once the newest of the ``keyframes``, all settled, ends a further window.
 
         True where this changes the readout in use.
@@ -124,7 +125,7 @@ class ReadoutSearch:
             self._take(window)
         return self._clock.readout_s != before_s
 
-    def _take(self, window: list[OdometryKeyframe]) -> None:
+    def _take(self, window: list[Frame]) -> None:
         now = self._clock.readout_s
         tried = now + STEP_S * np.arange(-1.0, 2.0) if self._is_sure else COARSE_S
         costs = [self._cost(window, float(readout_s), self._K) for readout_s in tried]
@@ -153,7 +154,7 @@ class ReadoutSearch:
             self._clock.readout_s = float(np.clip(mean, -MAX_READOUT_S, MAX_READOUT_S))
 
 
-def window_cost(window: list[OdometryKeyframe], readout_s: float, K: F64) -> tuple[float, int]:
+def window_cost(window: list[Frame], readout_s: float, K: F64) -> tuple[float, int]:
     """Huber cost, px^2, of the window adjusted with a readout, and its redundancy."""
     ids, index, camera, uv = observations(window, K, 3, readout_s)  # two give way to any readout
     T_camera_odom, free = np.stack([k.T_camera_odom for k in window]), np.arange(len(window)) > 0

@@ -22,8 +22,9 @@ from recon.calibration.tracks import pieces
 from recon.camera_model import scaled
 from recon.parallel import limit_threads
 from recon.pipeline.mapper import Mapper
-from recon.tracking.adjusted_track import AdjustedStill, AdjustedTrack
-from recon.tracking.frame import Frame
+from recon.rolling_shutter import RowClock, Rows
+from recon.tracking.adjusted_track import AdjustedTrack, adjusted_still
+from recon.tracking.frame import Frame, Landmarks
 from recon.types import F64, U8, Camera, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter
 from service.cameras.images import ImagesSource
@@ -214,19 +215,19 @@ def _turning(priors: Sequence[PosePrior], poses: F64, history: VehicleHistory) -
 
 def _track(found: JointAdjustment, views: dict[int, int], lens: Camera) -> AdjustedTrack:
     """The track of ``views``: rows of ``found`` by the number of the frame."""
-    rows, known = found.seen.view, np.asarray(np.isfinite(found.points).all(axis=1))
-    number = np.cumsum(known) - 1
-    shown = known[found.seen.landmark]
-    return AdjustedTrack(
-        {
-            seq: AdjustedStill(
-                found.poses[k], found.steps[k], found.rates[k], found.turn_covariances[k],
-                number[found.seen.landmark[shown & (rows == k)]],
-            )
-            for seq, k in views.items()
-        },
-        found.points[known], lens, found.sigma_readout_s,
-    )  # fmt: skip
+    known = np.asarray(np.isfinite(found.points).all(axis=1))
+    number, shown = np.cumsum(known) - 1, known[found.seen.landmark]
+    clock, ground, stills = RowClock(lens), Landmarks(), dict[int, Frame]()
+    ground.add(found.points[known])
+    for seq, k in views.items():
+        spread = np.zeros((6, 6))
+        spread[:3, :3] = found.turn_covariances[k]
+        rows = Rows(clock, found.rates[k], np.zeros(6), spread)
+        stills[seq] = adjusted_still(
+            seq, found.poses[k], found.steps[k], rows if lens.shutter.readout_s else None,
+            number[found.seen.landmark[shown & (found.seen.view == k)]], ground,
+        )  # fmt: skip
+    return AdjustedTrack(stills, lens, found.sigma_readout_s)
 
 
 def _note(before: Camera, lens: Camera, found: JointAdjustment, was_sought: bool) -> str:

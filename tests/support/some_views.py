@@ -10,21 +10,18 @@ from recon import se3
 from recon.pipeline.views import StereoView
 from recon.rolling_shutter import FrameRows
 from recon.stereo.posed_image import PosedImage
-from recon.tracking.frame import RelativePose
-from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose
 from recon.types import F64, PosePrior
 
 UNKNOWN, NO_MOTIONS = PosePrior(), dict[int, F64]()
 
 
-def keyframe_at(
-    seq: int, T_odom_camera: F64, segment: int = 0, is_measured: bool = False
-) -> OdometryKeyframe:
+def keyframe_at(seq: int, T_odom_camera: F64, segment: int = 0, is_measured: bool = False) -> Frame:
     """A keyframe of the odometry without corners."""
     row_motion = FrameRows(seq, UNKNOWN, T_odom_camera, is_measured=is_measured)
-    return OdometryKeyframe(
-        seq, segment, se3.inverse(T_odom_camera), np.eye(6), UNKNOWN, (),
-        np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), row_motion,
+    return Frame(
+        NO_IMAGE, seq, seq, segment=segment, row_motion=row_motion,
+        T_camera_odom=se3.inverse(T_odom_camera), covariance=np.eye(6),
     )  # fmt: skip
 
 

@@ -21,8 +21,7 @@ from recon.pipeline.views import (
     frames_apart,
 )
 from recon.rolling_shutter import FrameRows, RowClock, Rows
-from recon.tracking.frame import Frame, RelativePose, Tracking
-from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
+from recon.tracking.frame import Frame, Landmarks, RelativePose, Tracking
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
@@ -44,14 +43,14 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Fram
 class KnownTrack:
     """What views ask of an odometry."""
 
-    keyframes: list[OdometryKeyframe]
+    keyframes: list[Frame]
     exposure: ExposureWatch
     readout: ReadoutSearch | None = None
     segment: int = 0
 
 
 def stereo_camera(
-    keys: list[OdometryKeyframe],
+    keys: list[Frame],
     readout: ReadoutSearch | None = None,
     shown_s: float = 0.0,
     undistorter: Undistorter | None = None,
@@ -73,7 +72,7 @@ def offer(
 
 def test_colour_is_undistorted_when_its_view_is_given_and_not_kept() -> None:
     lens = Camera(np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), np.full(5, 0.05), (32, 32))
-    undistorter, keys = Mock(wraps=Undistorter(lens)), list[OdometryKeyframe]()
+    undistorter, keys = Mock(wraps=Undistorter(lens)), list[Frame]()
     undistorter.valid, undistorter.camera = np.ones((32, 32), np.uint8), lens
     views = stereo_camera(keys, undistorter=undistorter)
     held = []
@@ -221,7 +220,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
     ground, clock = Landmarks(), RowClock(Camera(K, np.zeros(5), size))
     corners = np.random.default_rng(0).uniform(-20, 20, (40, 2))
     ids = ground.add(np.c_[corners, np.full(40, 100.0)])
-    keys: list[OdometryKeyframe] = []
+    keys: list[Frame] = []
     views = stereo_camera(keys, Mock(ReadoutSearch, doubt_s=doubt_s))
     for i in range(3):
         plain = frame(i, 5.0 * i)
@@ -247,7 +246,7 @@ def test_views_wait_for_the_first_word_on_their_readout(
     is_open: bool, is_measured: bool, expected: list[int]
 ) -> None:
     """Not for stills, which never show it; the sixth view comes with that word."""
-    search, keys = Mock(ReadoutSearch, doubt_s=0.0, is_open=is_open), list[OdometryKeyframe]()
+    search, keys = Mock(ReadoutSearch, doubt_s=0.0, is_open=is_open), list[Frame]()
     views = stereo_camera(keys, search)
     given, counts = [], []
     for i in range(6):
@@ -264,7 +263,7 @@ def test_views_wait_for_the_first_word_on_their_readout(
 
 def test_a_view_that_waited_while_the_next_segment_grew_is_confirmed_by_its_own() -> None:
     """Only one of those is kept by then."""
-    search, keys = Mock(ReadoutSearch, doubt_s=0.0, is_open=True), list[OdometryKeyframe]()
+    search, keys = Mock(ReadoutSearch, doubt_s=0.0, is_open=True), list[Frame]()
     views = stereo_camera(keys, search)
     given = []
     for i in range(8):
@@ -280,7 +279,7 @@ def test_a_view_that_waited_while_the_next_segment_grew_is_confirmed_by_its_own(
 @pytest.mark.parametrize("exposure_s", [0.0, 0.05])
 def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: float) -> None:
     """1 m in each tenth of a second, 50 m above points 100 m further on, at 30 px."""
-    ground, keys = Landmarks(), list[OdometryKeyframe]()
+    ground, keys = Landmarks(), list[Frame]()
     corners = np.random.default_rng(0).uniform(-20, 20, (40, 2))
     ids = ground.add(np.c_[corners, np.full(40, 100.0)])
     views = stereo_camera(keys, shown_s=exposure_s)
@@ -302,7 +301,7 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
 def test_a_view_is_given_once_with_the_first_frame_that_shows_its_depth() -> None:
     """From the third view of a stretch on, by a sharp frame 0.3 of a step away, whether or not
     its other partners are there; then it comes again with all of them."""
-    keys = list[OdometryKeyframe]()
+    keys = list[Frame]()
     views = stereo_camera(keys)
 
     def take(seq: int, x_m: float, blurred: bool = False) -> None:

@@ -15,7 +15,6 @@ from tracked_frame import undistorted
 from recon import se3
 from recon.tracking import matching
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
-from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import TRACKED_LANDMARKS, Localiser
 from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Bool, Camera, PosePrior, Shutter
@@ -284,7 +283,7 @@ def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPa
     searched: list[tuple[int, bool, set[int]]] = []
     search = Localiser._search
 
-    def spy(self: Localiser, key: OdometryKeyframe, *rest: Any) -> Any:
+    def spy(self: Localiser, key: Frame, *rest: Any) -> Any:
         found = search(self, key, *rest)
         is_tracked = rest[3] is not None
         searched.append((key.seq, is_tracked, set(key.landmark[found[2]].tolist())))
