@@ -19,7 +19,6 @@ from recon.camera_model import project, rays
 from recon.parallel import run_parallel
 from recon.tracking import robust_geometry
 from recon.tracking.matching import Pyramid, match
-from recon.tracking.prediction import by_homography
 from recon.tracking.sift_features import Features, features, mutual
 from recon.types import F64, I64, U8, Camera
 
@@ -152,7 +151,7 @@ def sharpened(pyramid: Callable[[int], Pyramid], camera: Camera, seen: Sightings
         found = robust_geometry.homography(here, flat[rows], RELIEF_PX)
         if found is None:
             return
-        warp = by_homography(found[0], here)[1]
+        warp = robust_geometry.by_homography(found[0], here)[1]
         at = match(pyramid(a), here, pyramid(b), flat[rows], REACH_PX, warp)
         uv[rows[at.ok]] = at.uv_px[at.ok]
 

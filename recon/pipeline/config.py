@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
 
 Timing = Callable[[str], AbstractContextManager[object]]
 """Gives a stage by name the context that it runs in."""
@@ -23,20 +22,12 @@ CONTRADICTED = "pairs contradict each other"
 
 
 @dataclass(frozen=True, slots=True)
-class Baseline:
-    """Which frames become views: "auto", by base to height; "metres", one each ``amount``;
-    "frames", ``amount`` of ``every``, evenly spread, as the paper does."""
-
-    mode: Literal["auto", "metres", "frames"] = "auto"
-    amount: float = 0.0
-    every: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class MapperConfig:
     """Parameters of a :class:`recon.pipeline.mapper.Mapper`."""
 
-    baseline: Baseline = field(default_factory=Baseline)
+    # A view each so many metres along the track, or frames; by base to height where both are 0.
+    spacing_m: float = 0.0
+    spacing_frames: int = 0
     pairs: int = 4  # partners of a view, at most
     base_to_height: float = 0.1  # motion between the odometry's keyframes over the distance
     seeks_readout: bool = False  # the shutter's readout is a start, to be found by the images

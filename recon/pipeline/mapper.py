@@ -19,7 +19,7 @@ from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.mapping.voxel_map import VoxelMap, ground_sample_m
-from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
+from recon.pipeline.config import MapperConfig, Timing, untimed
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
@@ -33,7 +33,7 @@ from recon.pipeline.stages import (
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import StereoView, ViewSelection, VirtualStereoCamera
 from recon.posegraph.loop_search import LoopSearch
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
@@ -124,7 +124,9 @@ class Mapper:
             config.seeks_readout,
             config.base_to_height,
         )
-        selection = ViewSelection(config.baseline, config.pairs, all_known=known is not None)
+        selection = ViewSelection(
+            config.spacing_m, config.spacing_frames, config.pairs, all_known=known is not None
+        )
         self._waiting = Counter[str]()  # frames since a segment's first one, by reason
         self.views = VirtualStereoCamera(
             selection, self.odometry, self.undistort.undistorter, self.refused
@@ -144,7 +146,7 @@ class Mapper:
             first = replace(stereo, min_base_to_height=FIRST_BASE_TO_HEIGHT, guided=False,
                             width_px=stereo.width_px // COARSER)  # fmt: skip
             self._first_stereo = DenseStereo(backend, first, dense, Counter(), None, untimed)
-        trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
+        trajectory = Trajectory(PoseGraph(config.graph_keyframes))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, backend, self.rejected, timing)
         self.surface = SurfaceMap(trajectory.similarities, config.resolution_m, new_map)
@@ -192,7 +194,7 @@ class Mapper:
         return (*placed, *done, self._posed(tracked, is_view))
 
     def _posed(self, frame: Frame, is_view: bool) -> FramePosed:
-        plain = replace(frame, image=NO_IMAGE, gray=NO_IMAGE, pyramid=(), mask=None)
+        plain = replace(frame, image=NO_IMAGE, gray=NO_IMAGE, pyramid=(), features={}, mask=None)
         return FramePosed(plain, self.frames.place(frame), is_view)
 
     def locate(self, frame: Frame) -> list[Frame]:
@@ -307,9 +309,10 @@ class Mapper:
 
     # ---- in flight ---------------------------------------------------------------------
 
-    def set_baseline(self, baseline: Baseline) -> None:
-        """Apply a new baseline from the next frame on."""
-        self.views.selection.baseline = baseline
+    def set_spacing(self, metres: float, frames: int) -> None:
+        """Space views otherwise from the next frame on, as :class:`MapperConfig` says."""
+        selection = self.views.selection
+        selection.spacing_m, selection.spacing_frames = metres, frames
         self.stereo.set_min_base_to_height(self.views.selection.min_base_to_height)
 
     def set_effort(self, pairs: int, stereo_width_px: int, upsample: bool) -> None:

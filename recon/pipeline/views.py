@@ -1,8 +1,7 @@
 """Which frames become views of the virtual stereo camera, and which of them pair up.
 
-Three ways, by :class:`recon.pipeline.config.Baseline`: "auto" takes the odometry's keyframes,
-spaced by base-to-height; "metres" takes a frame every so far along the track; "frames" takes k of
-every m frames, evenly, as the paper does (two of every ten).
+Three ways: the odometry's keyframes, spaced by base-to-height; a frame every so far along the
+track; or every so many frames, as the paper does (two of every ten).
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.pipeline.config import TWO_ONLY, Baseline
+from recon.pipeline.config import TWO_ONLY
 from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import NEAR_S, depth_share, on_image
 from recon.row_errors import turn_shares
@@ -97,17 +96,21 @@ class ViewSelection:
     """Selects views from tracked frames and remembers the last few as partners."""
 
     def __init__(
-        self, baseline: Baseline | None = None, partners: int = 4, all_known: bool = False
+        self,
+        spacing_m: float = 0.0,
+        spacing_frames: int = 0,
+        partners: int = 4,
+        all_known: bool = False,
     ) -> None:
-        """At most ``partners`` of the last :data:`KEPT` views pair up with one of them, where the
-        baseline is "auto".
+        """Views are ``spacing_m`` apart, or ``spacing_frames``; by base to height where both are
+        0. Then at most ``partners`` of the last :data:`KEPT` views pair up with one of them.
 
         ``all_known``: the poses are final, and views wait for those on their far side.
 
         With more partners than the neighbouring views can be, tracked frames between them
         become partners too.
         """
-        self.baseline = baseline or Baseline()
+        self.spacing_m, self.spacing_frames = spacing_m, spacing_frames
         self.max_partners = partners
         self.takes_next = False  # the next frame with a pose, whatever the baseline asks for
         self._all_known = all_known
@@ -120,7 +123,7 @@ class ViewSelection:
 
     @property
     def _is_auto(self) -> bool:
-        return self.baseline.mode == "auto"
+        return not (self.spacing_m or self.spacing_frames)
 
     @property
     def frames_per_step(self) -> float:
@@ -197,12 +200,11 @@ class ViewSelection:
         if frame.state is Tracking.STARTED or not self._kept:
             return frame.state in (Tracking.STARTED, Tracking.KEYFRAME)
         last = self._kept[-1]
-        amount = self.baseline.amount
         if self._is_auto or last.segment != frame.segment:
             return frame.state is Tracking.KEYFRAME
-        if self.baseline.mode == "frames":
-            return frame.seq - last.seq >= frames_apart(int(amount), self.baseline.every)
-        return _apart(frame, last) >= amount
+        if self.spacing_frames:
+            return frame.seq - last.seq >= self.spacing_frames
+        return _apart(frame, last) >= self.spacing_m
 
     def ready(self, view: Frame) -> bool:
         """True when the view has two neighbours to pair with, or its segment is over."""
@@ -264,14 +266,6 @@ def _apart(a: Frame, b: Frame) -> float:
     return float(np.linalg.norm(a.T_odom_camera[:3, 3] - b.T_odom_camera[:3, 3]))
 
 
-def frames_apart(chosen: int, every: int) -> int:
-    """Frames between two views when ``chosen`` of ``every`` frames take part, evenly spread.
-
-    Two of every ten are ten frames apart: at 60 frames a second and 3 m/s the paper's 0.5 m.
-    """
-    return max(1, round(every / max(chosen - 1, 1)))
-
-
 class VirtualStereoCamera:
     """The virtual stereo camera: takes every frame, gives each view once its partners have come."""
 
@@ -300,7 +294,7 @@ class VirtualStereoCamera:
             self._segment = tracked.segment
         if tracked.T_tracked is None or tracked.relative is None:
             return False
-        frame = replace(tracked, pyramid=(), mask=None)
+        frame = replace(tracked, pyramid=(), features={}, mask=None)
         self._tracked.append((frame.time_ns, tracked.relative))
         is_view = self.selection.offer(frame)
         self._fixes.take(tracked.T_tracked, frame.prior)

@@ -16,7 +16,7 @@ from recon import se3
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix
-from recon.posegraph.records import Loop, Node, PoseGraphConfig
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
 from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
@@ -44,6 +44,10 @@ KNOWN_SCALE, UNKNOWN_SCALE = 0.1, 1.0
 """Sigma of the logarithm of a segment's first scale: at least, as its alignment fits one scale to
 a track whose scale drifts; and where no reading measures it."""
 
+SIGMA_STEP, SIGMA_SCALE_WALK = 0.002, 0.003
+"""Sigma of one motion of vision, as a share of its length, and of the change of the scale from
+block to block."""
+
 BLOCKS_PER_HEIGHT = 2.0
 """Heights above ground of so many blocks count as one: relief is the same under neighbours."""
 
@@ -69,10 +73,11 @@ class GraphFactors:
     """One build of the graph: the factors of its nodes and loops, and their solution."""
 
     def __init__(
-        self, config: PoseGraphConfig, segments: Segments, nodes: Collection[Node]
+        self, segments: Segments, nodes: Collection[Node], bias_tau_s: tuple[float, float, float]
     ) -> None:
         """How many readings share a sensor's bias follows from the ``nodes`` known so far."""
-        self._config, self._segments = config, segments
+        self._segments = segments
+        self._fix_s, self._attitude_s, self._altitude_s = bias_tau_s
         self.smoother = Smoother()
         times_ns = [node.time_ns for node in nodes]
         self._keyframes = max(len(times_ns), 1)
@@ -190,7 +195,7 @@ class GraphFactors:
             if node.key - self._since < BLOCK and not jump:
                 self._held += node.weight
                 return before
-            walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, self._held / BLOCK))
+            walk = SIGMA_SCALE_WALK * np.sqrt(max(1.0, self._held / BLOCK))
             sigma = float(np.hypot(walk, jump))
         key = self.smoother.append_scale(float(self.smoother.logs()[before]))
         self.smoother.add_scale("scale", (before, key), 0.0, sigma)
@@ -209,7 +214,7 @@ class GraphFactors:
         motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
         units = np.array([1.0] * 3 + [frame.scale] * 3)
         covariance = node.covariance * np.outer(units, units) + np.diag([1e-10] * 3 + [1e-6] * 3)
-        covariance[3:, 3:] += self._config.sigma_step**2 * np.outer(motion[:3, 3], motion[:3, 3])
+        covariance[3:, 3:] += SIGMA_STEP**2 * np.outer(motion[:3, 3], motion[:3, 3])
         return motion, covariance
 
     def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
@@ -264,7 +269,7 @@ class GraphFactors:
             self.left_out["view off" if prior.is_view_assumed else "tilt off"] += 1
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
-        sigma = sigma * self._inflation(self._config.attitude_s)
+        sigma = sigma * self._inflation(self._attitude_s)
         self.smoother.add_turn("attitude", node.key, R, sigma, HUBER_SIGMAS)
         return True
 
@@ -284,7 +289,7 @@ class GraphFactors:
             each = [one.effective_sigma(self._keyframes, self._span_s) for one in known]
             sigma = np.maximum(each, MIN_FIX_M)
         else:
-            tau_s = bias_time_constant_s(float(sigma[0]), self._config.fix_s)
+            tau_s = bias_time_constant_s(float(sigma[0]), self._fix_s)
             sigma = sigma * self._inflation(tau_s)
         self.smoother.add_place("position", node.key, prior.position_m, sigma, HUBER_SIGMAS)
         return True
@@ -301,7 +306,7 @@ class GraphFactors:
             self.left_out["altitude off"] += 1
             self._altitude_offset_m = prior.altitude_m - T[2, 3]
             return False
-        sigma = np.array([np.inf, np.inf, one * self._inflation(self._config.altitude_s)])
+        sigma = np.array([np.inf, np.inf, one * self._inflation(self._altitude_s)])
         place = np.array([0.0, 0.0, z])
         self.smoother.add_place("altitude", node.key, place, sigma, HUBER_SIGMAS)
         return True

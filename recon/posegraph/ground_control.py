@@ -67,10 +67,10 @@ class Mark:
     T_key_camera: F64 = field(default_factory=lambda: np.eye(4))  # for images between keyframes
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ControlPoint:
-    position_m: F64  # (3,)
-    sigma_m: F64  # (3,)
+Survey = tuple[F64, F64]
+"""Places (P, 3) m of surveyed points, and their sigmas (P, 3) m."""
+
+NO_SURVEY: Survey = (np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,7 @@ class Adjusted:
 
 def adjust(
     track: KeyframeTrack,
-    points: Sequence[ControlPoint] = (),
+    survey: Survey = NO_SURVEY,
     marks: Sequence[Mark] = (),
     sigma_scale: float = SIGMA_SCALE,
     sigma_scale_walk: float = SIGMA_SCALE_WALK,
@@ -130,7 +130,7 @@ def adjust(
     """
     if len(track.poses) < 2:
         raise ValueError(f"expected two poses (N, 4, 4) or more, got {track.poses.shape}")
-    args, n = (points, marks, sigma_scale, sigma_scale_walk), len(track.poses)
+    args, n = (survey, marks, sigma_scale, sigma_scale_walk), len(track.poses)
     smoother, refused = _solved(track, track.loops, *args), tuple[int, ...]()
     if track.loops:
         chi2 = np.sum(smoother.residuals()["loop"] ** 2, axis=1)
@@ -248,7 +248,7 @@ def _scale_key(keyframes: I64) -> I64:
 
 
 def _solved(
-    track: KeyframeTrack, loops: Sequence[Loop], points: Sequence[ControlPoint],
+    track: KeyframeTrack, loops: Sequence[Loop], survey: Survey,
     marks: Sequence[Mark], sigma: float, sigma_walk: float,
 ) -> Smoother:  # fmt: skip
     """All factors of one adjustment, solved.
@@ -270,7 +270,7 @@ def _solved(
         smoother.add_motion(
             "loop", one.ends, one.T_a_b, one.covariance, scale_key[one.a], UNIT, 1.5
         )
-    seen = _add_points(smoother, n, points, marks)
+    seen = _add_points(smoother, n, survey, marks)
     for mark in marks:
         R_camera_key = mark.T_key_camera[:3, :3].T
         far = 0.0 if mark.depth_m is None else 1.0 / mark.sigma_depth_m
@@ -319,15 +319,15 @@ def _add_telemetry(smoother: Smoother, track: KeyframeTrack) -> None:
 
 
 def _add_points(
-    smoother: Smoother, world: int, points: Sequence[ControlPoint], marks: Sequence[Mark]
+    smoother: Smoother, world: int, survey: Survey, marks: Sequence[Mark]
 ) -> dict[int, int]:
     """The ``world`` by its key and the points that images see after it; their keys by number."""
     smoother.append_pose(np.eye(4), np.zeros((6, 6)))
     _hold(smoother, world, np.eye(4), HELD_SIGMA, HELD_SIGMA)
     seen = {k: key for key, k in enumerate(sorted({m.point for m in marks}), world + 1)}
+    places_m, sigmas_m = survey
     for k, key in seen.items():
-        smoother.append_pose(se3.compose(np.eye(3), points[k].position_m), np.eye(6))
+        smoother.append_pose(se3.compose(np.eye(3), places_m[k]), np.eye(6))
         smoother.add_turn(HELD, key, np.eye(3), np.full(3, HELD_SIGMA))
-        sigma = np.maximum(points[k].sigma_m, 1e-3)
-        smoother.add_place("survey", key, points[k].position_m, sigma)
+        smoother.add_place("survey", key, places_m[k], np.maximum(sigmas_m[k], 1e-3))
     return seen

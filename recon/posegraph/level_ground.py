@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from recon import se3
+from recon.plane import plane_normal
 from recon.types import F64, PosePrior
 
 ASSUMED_TILT_RAD = math.radians(6.0)
@@ -32,9 +33,6 @@ FAR = 3.0
 """Times the median distance from the middle; landmarks beyond are placed badly, and tilt a plane by
 their long lever."""
 
-ROUNDS = 8
-"""Fits of a plane, each with the weights of the one before."""
-
 
 def levelled(prior: PosePrior, points: F64) -> PosePrior:
     """The prior with the tilt that lays the ground level, where the assumed mount is far from it.
@@ -44,7 +42,7 @@ def levelled(prior: PosePrior, points: F64) -> PosePrior:
     R = prior.R_world_camera
     if R is None or not prior.is_view_assumed:
         return prior
-    normal = plane_normal(points)
+    normal = _ground_normal(points)
     if normal is None or normal @ R[2] > math.cos(MAX_SLOPE_RAD):
         return prior
     up = R @ normal
@@ -56,27 +54,11 @@ def levelled(prior: PosePrior, points: F64) -> PosePrior:
     )  # fmt: skip
 
 
-def plane_normal(points: F64) -> F64 | None:
-    """(3,) unit normal, towards the origin, of the plane through points (N, 3); None for too few,
-    or where they lie on no plane."""
-    if len(points) >= MIN_POINTS:
-        far = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-        points = points[far <= FAR * np.median(far)]
+def _ground_normal(points: F64) -> F64 | None:
+    """(3,) unit normal, upwards, of the ground through landmarks (N, 3); None where they are too
+    few, or on no plane."""
     if len(points) < MIN_POINTS:
         return None
-    normal, size = plane_through(points)
-    if not size[2] < MAX_THICKNESS * size[1]:
-        return None
-    return np.asarray(-normal if normal @ np.median(points, axis=0) > 0 else normal, np.float64)
-
-
-def plane_through(points: F64) -> tuple[F64, F64]:
-    """(3,) unit normal of the plane that most of three or more points (N, 3) lie near, and their
-    extent along its three axes (3,), largest first. Weights are the inverse of the distance."""
-    weight = np.ones(len(points))
-    for _ in range(ROUNDS):
-        about = points - weight @ points / weight.sum()
-        _, size, rows = np.linalg.svd(about * np.sqrt(weight)[:, None], full_matrices=False)
-        off = np.abs(about @ rows[2])
-        weight = 1.0 / np.maximum(off, max(float(np.median(off)), 1e-6))
-    return np.asarray(rows[2]), size
+    far = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    near = points[far <= FAR * np.median(far)]
+    return plane_normal(near, MAX_THICKNESS) if len(near) >= MIN_POINTS else None

@@ -15,7 +15,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import project, rays
 from recon.mapping.registration import agreed_motion, register_projective
-from recon.posegraph.level_ground import plane_through
+from recon.plane import plane_normal
 from recon.tracking import matching, pnp
 from recon.tracking.sift_features import FEATURE_SHARES, features, match_features
 from recon.types import F32, F64, I64, U8, Bool, DepthMap
@@ -59,7 +59,7 @@ def ground_seen(depth: DepthMap) -> F64:
     known = np.isfinite(z)
     if not known.any():
         return np.zeros((0, 3))
-    normal = plane_normal(grid[known] * z[known, None])
+    normal = _slope(grid[known] * z[known, None])
     level = float(np.median(np.sum(grid[known] * normal, axis=1) * z[known]))
     slope = grid @ normal
     ahead = slope * np.sign(level) > 1e-3  # the others look above the horizon
@@ -68,16 +68,10 @@ def ground_seen(depth: DepthMap) -> F64:
     return np.asarray(grid[usable] * z[usable, None])
 
 
-def plane_normal(points: F64) -> F64:
-    """(3,) unit normal of the plane that most of the points (N, 3) lie near, away from the camera.
-
-    Of fewer than three points, or points in a line, the camera's axis.
-    """
-    if len(points) >= 3:
-        normal, size = plane_through(points)
-        if size[1] >= 0.02 * size[0]:
-            return np.asarray(normal * np.sign(normal[2] if normal[2] else 1.0))
-    return np.array([0.0, 0.0, 1.0])
+def _slope(points: F64) -> F64:
+    """(3,) unit normal of the plane through points (N, 3); the image's where there is none."""
+    normal = plane_normal(points)
+    return np.array([0.0, 0.0, 1.0]) if normal is None else normal
 
 
 def candidates(
@@ -185,7 +179,7 @@ def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
     Each landmark's surface is taken to be parallel to the plane that most of them lie on, so
     that two oblique views of the ground from opposite sides still compare like with like.
     """
-    normal = plane_normal(points)
+    normal = _slope(points)
     level = np.sum(points * normal, axis=1)
     out = np.empty((len(uv), 2, 2))
     here = project(K_b, se3.transform(T_b_a, points))

@@ -14,14 +14,13 @@ import numpy as np
 from recon import parallel, se3
 from recon.posegraph.factors import GraphFactors
 from recon.posegraph.pose_priors import is_frozen, sound
-from recon.posegraph.records import LOOP_WINDOW, Loop, Node, PoseGraphConfig, loops_agree
+from recon.posegraph.records import LOOP_WINDOW, Loop, Node, loops_agree
 from recon.posegraph.segments import Segments
+from recon.posegraph.sensor_noise import BIAS_TAU_S
 from recon.posegraph.sensor_offsets import Constants
 from recon.posegraph.smoother import MANY_STEPS, STEPS, reversed_motion
 from recon.posegraph.thinning import GONE_SHARE, moved_loops, thin
 from recon.types import F64, Pose, PosePrior
-
-__all__ = ["PoseGraph", "PoseGraphConfig"]
 
 log = logging.getLogger(__name__)
 
@@ -43,14 +42,18 @@ class PoseGraph:
     use this package's conventions (left perturbations).
     """
 
-    def __init__(self, config: PoseGraphConfig | None = None) -> None:
-        self.config = config or PoseGraphConfig()
+    def __init__(
+        self, max_nodes: int = 100_000, bias_tau_s: tuple[float, float, float] = BIAS_TAU_S
+    ) -> None:
+        """Of more than ``max_nodes`` keyframes some are interpolated; the sensors' errors wander
+        with the time constants ``bias_tau_s`` of fixes, attitudes and altitudes, 0 for none."""
+        self.max_nodes, self._bias_tau_s = max_nodes, bias_tau_s
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
-        self._thin_at = self.config.max_nodes
+        self._thin_at = max_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
-        self.segments = Segments(self.config)
+        self.segments = Segments(bias_tau_s)
         self.loops: list[Loop] = []
         self.pending: list[Loop] = []
         self._built = 0
@@ -231,7 +234,7 @@ class PoseGraph:
 
     def _start(self) -> None:
         self._built += 1
-        self._factors = GraphFactors(self.config, self.segments, self._nodes.values())
+        self._factors = GraphFactors(self.segments, self._nodes.values(), self._bias_tau_s)
         self._smoother = self._factors.smoother
 
     def rebuild(self) -> None:
@@ -266,7 +269,7 @@ class PoseGraph:
             moved_loops(loops, marginalised, dropped, len(nodes))
             for loops in (self.loops, self.pending)
         )
-        self._thin_at = max(self.config.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
+        self._thin_at = max(self.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()
 

@@ -1,4 +1,4 @@
-"""Records of the pose graph about keyframes and loops, and its parameters."""
+"""Records of the pose graph about keyframes and loops."""
 
 from __future__ import annotations
 
@@ -7,20 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.sensor_noise import ALTITUDE_S, ATTITUDE_S, FIX_S
 from recon.types import F64, PosePrior
-
-
-@dataclass(frozen=True, slots=True)
-class PoseGraphConfig:
-    """Size of the graph, and how its sensors err; docs/pose-graph.md says where each enters."""
-
-    max_nodes: int = 100_000  # keyframes in the graph; of more, some are interpolated
-    fix_s: float = FIX_S
-    attitude_s: float = ATTITUDE_S
-    altitude_s: float = ALTITUDE_S
-    sigma_step: float = 0.002  # of one vision motion, as a share of its length
-    sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

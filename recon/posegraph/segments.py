@@ -12,7 +12,8 @@ from recon.posegraph import alignment
 from recon.posegraph.alignment import Scale
 from recon.posegraph.alignment_readings import Alignment, ReadingNoise
 from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
-from recon.posegraph.records import Node, PoseGraphConfig
+from recon.posegraph.records import Node
+from recon.posegraph.sensor_noise import BIAS_TAU_S
 from recon.posegraph.sensor_offsets import Constants, constants, with_offsets
 from recon.types import F64, PosePrior
 
@@ -115,9 +116,10 @@ class Segment:
 class Segments:
     """The segments of one flight, by number; each begins when it is asked for first."""
 
-    def __init__(self, config: PoseGraphConfig) -> None:
+    def __init__(self, bias_tau_s: tuple[float, float, float] = BIAS_TAU_S) -> None:
+        """``bias_tau_s`` as :data:`recon.posegraph.sensor_noise.BIAS_TAU_S`."""
         self._all: dict[int, Segment] = {}
-        self._bias_tau_s = config.fix_s, config.attitude_s
+        self._bias_tau_s = bias_tau_s[:2]
 
     def __getitem__(self, number: int) -> Segment:
         if number not in self._all:

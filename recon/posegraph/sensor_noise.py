@@ -17,7 +17,7 @@ from recon.types import F64
 MIN_READINGS = 12
 """Readings from which on their scatter is measured."""
 
-FIX_S, ATTITUDE_S, ALTITUDE_S = 60.0, 40.0, 120.0
+BIAS_TAU_S = FIX_S, ATTITUDE_S, ALTITUDE_S = 60.0, 40.0, 120.0
 """Usual time constants with which a receiver's error wanders, an attitude's and a barometer's."""
 
 TAUS_S = (2.0, 5.0, 10.0, 20.0, 40.0)

@@ -13,7 +13,7 @@ from recon.tracking.focal_watch import FocalWatch
 from recon.tracking.frame import NO_IMAGE, UNKNOWN, Frame, Landmarks, RelativePose, Tracking
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry
-from recon.tracking.readout_search import ReadoutEstimate, ReadoutSearch
+from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, Camera, PosePrior
 
 KEPT = 8
@@ -33,8 +33,8 @@ class AdjustedTrack:
         self.exposure, self.focal = ExposureWatch(), FocalWatch(lens.K)  # no window is adjusted
         self.readout = ReadoutSearch(RowClock(lens), lens.K) if sigma_readout_s else None
         if self.readout is not None:  # and its search is over
-            known = lens.shutter.readout_s, sigma_readout_s, len(stills)
-            self.readout.estimate = ReadoutEstimate(*known)
+            self.readout.readout_s, self.readout.sigma_s = lens.shutter.readout_s, sigma_readout_s
+            self.readout.windows = len(stills)
         self.K, self._stills = lens.K, stills
 
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import GLOBAL_SHUTTER, FrameRows
 from recon.tracking.matching import Pyramid
+from recon.tracking.sift_features import Features
 from recon.types import F64, I64, U8, Bool, PosePrior
 
 NO_IMAGE: U8 = np.zeros((0, 0), np.uint8)
@@ -120,6 +121,7 @@ class Frame:
     prior: PosePrior = UNKNOWN
     gray: U8 = field(default_factory=lambda: NO_IMAGE)  # (H, W) without distortion
     pyramid: Pyramid = ()  # of (h, w) gray, as the odometry takes it
+    features: dict[int, Features] = field(default_factory=dict)  # found so far, by their width
     mask: U8 | None = None  # (h, w) non-zero where the image is valid; None: everywhere
     is_blurred: bool = False  # takes no part in stereo, only in the track
     state: Tracking = Tracking.SKIPPED

@@ -19,7 +19,17 @@ from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.frame import Frame
 from recon.tracking.keyframe_window import median_depth
 from recon.tracking.prediction import ConstantVelocity
-from recon.tracking.sift_features import FEATURE_SHARES, FeatureCache, FeatureMatches
+from recon.tracking.sift_features import (
+    FEATURE_SHARES,
+    FINE_MOST,
+    FINE_WIDTH_PX,
+    MOST,
+    WIDTH_PX,
+    FeatureMatches,
+    Features,
+    features,
+    match_features,
+)
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
 MIN_BASE_TO_HEIGHT = 0.03
@@ -84,7 +94,6 @@ class Localiser:
 
     def __init__(self, camera: Camera, row_track: RowTrack) -> None:
         self.camera, self._row_track = camera, row_track
-        self._features = FeatureCache()  # finds views that no motion predicts
         self._near_px = [share * camera.size_px[0] for share in FEATURE_SHARES]
         self._drift = np.eye(3)  # from the pixels of a segment's first frame to the last one's
 
@@ -157,7 +166,7 @@ class Localiser:
         Treetops have few corners that look alike from two places. Features follow the corners that
         are there, each place once however often it is found.
         """
-        shared = self._features.match_finely((key.seq, key.pyramid[0]), (new.seq, new.small))
+        shared = match_finely(key, new)
         if shared is None:
             return None
         row_of = {tuple(place): row for row, place in enumerate(key.uv.tolist())}
@@ -247,10 +256,9 @@ class Localiser:
         self, new: Frame, keyframes: Sequence[Frame], low_frame_rate: bool
     ) -> list[tuple[Frame, FeatureMatches]]:
         """Recent keyframes that share features with the frame, the most first."""
-        here, found = (new.seq, new.small), []
+        found = []
         for key in keyframes[-RECALLED:]:
-            there = key.seq, key.pyramid[0]
-            shared = self._features.match_features(there, here, low_frame_rate)
+            shared = match_images(key, new, low_frame_rate)
             if shared is not None:
                 found.append((key, shared))
         return sorted(found, key=lambda item: -len(item[1]))
@@ -419,12 +427,11 @@ class Localiser:
         """Where the corners went, with warps and radius in px, best first."""
         wide_px = WIDE_SEARCH_SHARE * self.camera.size_px[0]
         if not low_frame_rate:
-            yield *prediction.by_homography(self._drift, first.uv), wide_px
+            yield *robust_geometry.by_homography(self._drift, first.uv), wide_px
         if R_b_a is not None:
             H = self._by_telemetry(new, first, R_b_a)
-            yield *prediction.by_homography(H, first.uv), wide_px
-        images = (first.seq, first.pyramid[0]), (new.seq, new.small)
-        shared = self._features.match_features(*images, low_frame_rate)
+            yield *robust_geometry.by_homography(H, first.uv), wide_px
+        shared = match_images(first, new, low_frame_rate)
         if shared is not None:
             guess = shared.predict(first.uv)
             for radius_px in self._near_px:
@@ -449,3 +456,23 @@ class Localiser:
             radius_px, warp.astype(np.float32),
         )  # fmt: skip
         return found.uv_px.astype(np.float64), found.ok
+
+
+def match_images(a: Frame, b: Frame, low_frame_rate: bool) -> FeatureMatches | None:
+    """The features that two frames share, or None.
+
+    Stills are compared in finer detail where they need it: they are few and far apart.
+    """
+    shared = match_features(*(_features(image, WIDTH_PX, MOST) for image in (a, b)))
+    return match_finely(a, b) if shared is None and low_frame_rate else shared
+
+
+def match_finely(a: Frame, b: Frame) -> FeatureMatches | None:
+    return match_features(*(_features(image, FINE_WIDTH_PX, FINE_MOST) for image in (a, b)))
+
+
+def _features(frame: Frame, width_px: int, most: int) -> Features:
+    """Those of a frame, which keeps them."""
+    if width_px not in frame.features:
+        frame.features[width_px] = features(frame.small, width_px, most)
+    return frame.features[width_px]

@@ -69,6 +69,8 @@ class ExposureWatch:
 
     def __init__(self) -> None:
         self._streaks: deque[tuple[float, float]] = deque(maxlen=KEPT)  # px, px/s
+        # The strongest ``blur_px`` so far, and the exposure in s then; None while images are sharp.
+        self.strongest: tuple[float, float] | None = None
 
     def add(self, gray: U8, px_s: F64, gap_s: float) -> None:
         """Take a keyframe (H, W), the motion (2,) in it and the time since the frame before."""
@@ -78,6 +80,9 @@ class ExposureWatch:
         streak = streak_px(gray, px_s / speed)
         if np.isfinite(streak):  # no frame is exposed for longer than until the next
             self._streaks.append((min(streak, speed * gap_s), speed))
+            blur_px, exposure_s = self.blur_px, self.exposure_s
+            if exposure_s is not None and blur_px > (self.strongest or (0.0, 0.0))[0]:
+                self.strongest = blur_px, exposure_s
 
     @property
     def exposure_s(self) -> float | None:

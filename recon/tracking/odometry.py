@@ -381,14 +381,14 @@ class Odometry:
             search = self.readout if self._row_track.is_rolling else None
             if search is not None and search.look(self.keyframes):
                 adjust_window(self.keyframes, self.K)
-            if search is not None and search.estimate is not None and search.estimate.is_none:
+            if search is not None and search.is_none:
                 self._row_track.stop()
 
     def _forget(self) -> None:
         """Drop images and corners that left the window, and landmarks out of sight."""
         window = self.keyframes[-WINDOW - 2 :]
         for old in self.keyframes[: -len(window)]:
-            old.pyramid = ()
+            old.pyramid, old.features = (), {}
             old.uv, old.landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
         self.keyframes = window
         seen = np.concatenate([k.landmark for k in window])

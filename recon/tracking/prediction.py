@@ -51,12 +51,6 @@ def _robust_plane(P: F64) -> F64:  # pragma: no cover - compiled
     return q[:, 0]
 
 
-def by_homography(H: F64, uv: F64) -> tuple[F64, F64]:
-    """Where (N, 2) pixels ``uv`` go, and the warps (N, 2, 2) of offsets there."""
-    there = cv2.perspectiveTransform(uv[:, None], H)[:, 0].astype(np.float64)
-    return there, _local_affine(H, uv, there)
-
-
 def common_affine(uv: F64, there: F64) -> F64:
     """(3, 3) affine motion of pixels ``uv`` (N, 2) to ``there`` (N, 2), robust."""
     A = robust_geometry.affine(uv, there, 8.0)
@@ -77,7 +71,7 @@ def on_landmarks(
     plane = inverse_depth_plane(P_key)
     H = K @ (T_new_key[:3, :3] + np.outer(T_new_key[:3, 3], plane)) @ np.linalg.inv(K)
     uv = cv2.perspectiveTransform(key.uv[:, None], H)[:, 0].astype(np.float64)
-    warp = _local_affine(H, key.uv, uv)
+    warp = robust_geometry.local_affine(H, key.uv, uv)
     P_new = se3.transform(T_new_key, P_key)
     uv[known] = P_new[:, :2] / P_new[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
     W, Hh = size_px
@@ -158,12 +152,6 @@ def metric_scale(
         if flown > 0:
             return flown
     return 1.0
-
-
-def _local_affine(H: F64, uv: F64, there: F64) -> F64:
-    """(N, 2, 2) Jacobian of the homography at each pixel."""
-    w = uv @ H[2, :2] + H[2, 2]
-    return np.asarray((H[None, :2, :2] - there[:, :, None] * H[2, :2]) / w[:, None, None])
 
 
 def fresh_corners(corners: F64, kept: F64, size_px: tuple[int, int], grid: int) -> F64:

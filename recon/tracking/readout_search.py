@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -57,21 +56,32 @@ USUAL_S = 0.02
 """Sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReadoutEstimate:
-    """A readout in s, negative against the shutter's direction, its sigma, and of how many windows.
+Cost = Callable[["list[Frame]", float, F64], tuple[float, int]]
+"""(Keyframes, readout in s, K) to :func:`window_cost`."""
 
-    It ``is_sure`` where two windows or more agree that it is not zero.
+
+class ReadoutSearch:
+    """Looks at keyframes as they settle, and sets the clock of their rows.
+
+    ``readout_s`` is negative against the shutter's direction; ``windows`` of keyframes show it, 0
+    until one does.
     """
 
-    readout_s: float
-    sigma_s: float
-    windows: int
+    def __init__(self, clock: RowClock, K: F64, cost: Cost | None = None) -> None:
+        """``cost`` says how well a window fits a readout; by default :func:`window_cost`."""
+        self.readout_s, self.sigma_s, self.windows = 0.0, USUAL_S, 0
+        self._clock, self._K, self._cost = clock, K, cost or window_cost
+        self._last_seq = -1
+        self._found: deque[tuple[float, float]] = deque(maxlen=4)  # readout, weight
+
+    @property
+    def is_open(self) -> bool:
+        return self.windows == 0 and self._clock.readout_s == 0.0
 
     @property
     def is_sure(self) -> bool:
-        is_known = self.windows >= MIN_WINDOWS
-        return is_known and abs(self.readout_s) > MIN_SIGMAS * self.sigma_s
+        """True where the windows agree that it is not zero."""
+        return self.windows >= MIN_WINDOWS and abs(self.readout_s) > MIN_SIGMAS * self.sigma_s
 
     @property
     def is_none(self) -> bool:
@@ -79,36 +89,13 @@ class ReadoutEstimate:
         is_known = self.windows >= MIN_WINDOWS and self.sigma_s < GLOBAL_S
         return is_known and abs(self.readout_s) < GLOBAL_S
 
-
-Cost = Callable[["list[Frame]", float, F64], tuple[float, int]]
-"""(Keyframes, readout in s, K) to :func:`window_cost`."""
-
-
-class ReadoutSearch:
-    """Looks at keyframes as they settle, and sets the clock of their rows."""
-
-    def __init__(self, clock: RowClock, K: F64, cost: Cost | None = None) -> None:
-        """``cost`` says how well a window fits a readout; by default :func:`window_cost`."""
-        self.estimate: ReadoutEstimate | None = None
-        self._clock, self._K, self._cost = clock, K, cost or window_cost
-        self._last_seq = -1
-        self._found: deque[tuple[float, float]] = deque(maxlen=4)  # readout, weight
-
-    @property
-    def is_open(self) -> bool:
-        return self.estimate is None and self._clock.readout_s == 0.0
-
-    @property
-    def _is_sure(self) -> bool:
-        return self.estimate is not None and self.estimate.is_sure
-
     @property
     def doubt_s(self) -> float:
         """Sigma of the readout in use."""
-        if self.estimate is None:
+        if self.windows == 0:
             return USUAL_S if self.is_open else 0.0
-        off_s = self.estimate.readout_s - self._clock.readout_s
-        return min(float(np.hypot(self.estimate.sigma_s, off_s)), USUAL_S)
+        off_s = self.readout_s - self._clock.readout_s
+        return min(float(np.hypot(self.sigma_s, off_s)), USUAL_S)
 
     def look(self, keyframes: list[Frame]) -> bool:
         """Search once the newest of the ``keyframes``, all settled, ends a further window.
@@ -116,7 +103,7 @@ class ReadoutSearch:
         True where this changes the readout in use.
         """
         before_s = self._clock.readout_s
-        size = KEYFRAMES if self._is_sure or self.doubt_s == 0.0 else FIRST_KEYFRAMES
+        size = KEYFRAMES if self.is_sure or self.doubt_s == 0.0 else FIRST_KEYFRAMES
         window = keyframes[-size:]
         if len(window) < size or window[0].seq < self._last_seq:
             return False
@@ -127,7 +114,7 @@ class ReadoutSearch:
 
     def _take(self, window: list[Frame]) -> None:
         now = self._clock.readout_s
-        tried = now + STEP_S * np.arange(-1.0, 2.0) if self._is_sure else COARSE_S
+        tried = now + STEP_S * np.arange(-1.0, 2.0) if self.is_sure else COARSE_S
         costs = [self._cost(window, float(readout_s), self._K) for readout_s in tried]
         k = int(np.clip(np.argmin([cost for cost, _ in costs]), 1, len(tried) - 2))
         (below, _), (here, redundancy), (above, _) = costs[k - 1 : k + 2]
@@ -148,7 +135,7 @@ class ReadoutSearch:
         mean = float(weights @ readouts / weights.sum())
         spread = weights @ (readouts - mean) ** 2 / weights.sum() / max(len(weights) - 1, 1)
         sigma = float(np.sqrt(max(1.0 / weights.sum(), spread, floor_s**2)))
-        self.estimate = ReadoutEstimate(mean, sigma, len(weights))
+        self.readout_s, self.sigma_s, self.windows = mean, sigma, len(weights)
         is_refined = self._clock.readout_s != 0.0 and sigma < GLOBAL_S
         if is_refined or abs(mean) > MIN_SIGMAS * sigma:
             self._clock.readout_s = float(np.clip(mean, -MAX_READOUT_S, MAX_READOUT_S))

@@ -134,6 +134,18 @@ def homography(uv_a: F64, uv_b: F64, threshold_px: float) -> tuple[F64, Bool] | 
     return np.asarray(H, np.float64), inliers
 
 
+def by_homography(H: F64, uv: F64) -> tuple[F64, F64]:
+    """Where (N, 2) pixels ``uv`` go, and the warps (N, 2, 2) of offsets there."""
+    there = cv2.perspectiveTransform(uv[:, None], H)[:, 0].astype(np.float64)
+    return there, local_affine(H, uv, there)
+
+
+def local_affine(H: F64, uv: F64, there: F64) -> F64:
+    """(N, 2, 2) Jacobian of the homography at each pixel."""
+    w = uv @ H[2, :2] + H[2, 2]
+    return np.asarray((H[None, :2, :2] - there[:, :, None] * H[2, :2]) / w[:, None, None])
+
+
 def homography_motions(H: F64, K: F64) -> list[tuple[F64, F64]]:
     """(R_b_a, t of T_b_a in units of the plane's distance) that ``H`` may stand for."""
     found = attempt(lambda: cv2.decomposeHomographyMat(H, K))

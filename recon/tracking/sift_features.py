@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from recon.tracking import robust_geometry
-from recon.tracking.prediction import by_homography
 from recon.types import F32, F64, U8
 
 WIDTH_PX = 480
@@ -46,9 +45,6 @@ as good."""
 SIGNATURE_WIDTH_PX, SIGNATURE, SIGNATURE_STEPS = 320, 200, 400.0
 """Image width and number of features that describe the look of an image, and levels of a
 descriptor's byte."""
-
-KEPT = 16
-"""Images whose features are remembered."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +91,7 @@ class FeatureMatches:
     def predict(self, uv_px: F64) -> tuple[F64, F64]:
         """Where (N, 2) the pixels ``uv_px`` (N, 2) of image a are in image b, and the warps
         (N, 2, 2) of offsets there."""
-        return self.carry(uv_px), by_homography(self.H, uv_px)[1]
+        return self.carry(uv_px), robust_geometry.by_homography(self.H, uv_px)[1]
 
 
 def features(
@@ -181,35 +177,3 @@ def signature(gray: U8) -> U8:
     """(N, 128) descriptors of the largest features of an image, in 26 kB."""
     largest = features(gray, SIGNATURE_WIDTH_PX).descriptors[:SIGNATURE]
     return np.asarray(np.clip(np.rint(largest * SIGNATURE_STEPS), 0, 255), np.uint8)
-
-
-class FeatureCache:
-    """Features of the last few images by number, found when they are first asked for."""
-
-    def __init__(self, kept: int = KEPT) -> None:
-        self._kept = kept
-        self._of: dict[tuple[int, int], Features] = {}
-
-    def match_features(
-        self, a: tuple[int, U8], b: tuple[int, U8], low_frame_rate: bool
-    ) -> FeatureMatches | None:
-        """What two images, each by number and pixels (H, W), share, or None.
-
-        Stills are compared in finer detail where they need it: they are few and far apart.
-        """
-        shared = match_features(self.of(*a), self.of(*b))
-        return self.match_finely(a, b) if shared is None and low_frame_rate else shared
-
-    def match_finely(self, a: tuple[int, U8], b: tuple[int, U8]) -> FeatureMatches | None:
-        """The same in fine detail."""
-        return match_features(*(self.of(*image, FINE_WIDTH_PX, FINE_MOST) for image in (a, b)))
-
-    def of(self, seq: int, gray: U8, width_px: int = WIDTH_PX, most: int = MOST) -> Features:
-        """Features of image ``seq``, which is ``gray`` (H, W)."""
-        known = self._of.pop((seq, width_px), None)
-        if known is None:
-            known = features(gray, width_px, most)
-        self._of[seq, width_px] = known
-        while len(self._of) > self._kept:
-            del self._of[next(iter(self._of))]
-        return known

@@ -14,6 +14,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project
+from recon.plane import plane_normal
 from recon.tracking import bundle, robust_geometry
 from recon.types import F64, Bool
 
@@ -110,25 +111,6 @@ def reprojection_error(T_camera_world: F64, points_m: F64, K: F64, uv_px: F64) -
     return np.asarray(np.where(np.isfinite(error), error, np.inf))
 
 
-def ground_normal(points: F64) -> F64:
-    """(3,) unit normal of the plane through most of the (N, 3) points, z component < 0.
-
-    In a camera frame (z forward) that normal points back at the camera. Re-weighted total
-    least squares; good for relief that is small compared with the distance.
-    """
-    weights = np.ones(len(points))
-    normal = np.array([0.0, 0.0, -1.0])
-    for _ in range(8):
-        mean = np.average(points, axis=0, weights=weights)
-        d = points - mean
-        _, vectors = np.linalg.eigh((d * weights[:, None]).T @ d)
-        normal = vectors[:, 0]
-        error = np.abs(d @ normal)
-        scale = max(1.4826 * float(np.median(error)), 1e-9)
-        weights = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
-    return np.asarray(-normal if normal[2] > 0 else normal)
-
-
 def solve(
     uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None, max_turn_rad: float, up_a: F64
 ) -> TwoView | None:
@@ -156,8 +138,8 @@ def solve(
             turn = float(np.linalg.norm(se3.so3_log(view.T_b_a[:3, :3] @ R_b_a.T)))
             if turn > max_turn_rad:
                 continue
-        level = float(ground_normal(view.points[view.inliers]) @ up_a)
-        found.append((view, level))
+        normal = plane_normal(view.points[view.inliers])
+        found.append((view, -1.0 if normal is None else float(normal @ up_a)))
     if not found:
         return None
     most = max(int(view.inliers.sum()) for view, _ in found)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from recon.backends import Backend
 from recon.parallel import limit_threads
-from recon.pipeline.config import Baseline, MapperConfig
+from recon.pipeline.config import MapperConfig
 from recon.pipeline.mapper import Mapper, Reconstruct, Reconstructed
 from recon.pipeline.views import StereoView
 from recon.tracking.adjusted_track import AdjustedTrack
@@ -30,17 +30,27 @@ def counts(view: StereoView) -> bool:
     return not view.is_first_depth
 
 
-def baseline_of(scan: ScanConfig) -> Baseline:
-    return Baseline(*parse_baseline(scan.baseline))
+def spacing_of(scan: ScanConfig) -> tuple[float, int]:
+    """Metres and frames between two views by ``scan.baseline``; 0 and 0: by base to height.
+
+    Two of every ten frames, evenly spread, are ten frames apart: at 60 frames a second and 3 m/s
+    the paper's 0.5 m.
+    """
+    mode, amount, every = parse_baseline(scan.baseline)
+    if mode == "frames":
+        return 0.0, max(1, round(every / max(int(amount) - 1, 1)))
+    return amount, 0
 
 
 def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperConfig:
     """The mapper's parameters by the configuration; ``live`` for a flight that can be followed."""
     compute, scan, link = config.compute, config.scan, config.datalink
+    spacing_m, spacing_frames = spacing_of(scan)
     is_sent = live and bool(link.connect or link.listen)
     is_sent = is_sent and 125.0 * link.budget_kbit_s * link.share >= FIRST_BYTES_S
     return MapperConfig(
-        baseline=baseline_of(scan),
+        spacing_m=spacing_m,
+        spacing_frames=spacing_frames,
         pairs=compute.pairs,
         base_to_height=scan.base_to_height,
         seeks_readout=seeks_readout(camera, config.camera),

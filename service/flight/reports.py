@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -211,34 +211,21 @@ class TrackingWatch:
             self._is_reported = True
 
 
-class ShutterWatch:
-    """Reports once that the shutter is too slow for the speed."""
+def motion_blur(exposure: ExposureWatch, px_per_px: float) -> dict[str, Any] | None:
+    """The strongest blur so far, fit for JSON; None while the images are sharp.
 
-    def __init__(
-        self, exposure: ExposureWatch, px_per_px: float, warn: Callable[[str], None]
-    ) -> None:
-        """``px_per_px``: pixels of the recording to one of the images that are tracked."""
-        self._exposure, self._px_per_px, self._warn = exposure, px_per_px, warn
-        self.summary: dict[str, Any] | None = None
-        """The strongest blur so far, fit for JSON; None while the images are sharp."""
+    ``px_per_px``: pixels of the recording to one of the images that are tracked.
+    """
+    if exposure.strongest is None:
+        return None
+    blur_px, exposure_s = exposure.strongest
+    return {"blur_px": round(px_per_px * blur_px, 1), "exposure_ms": round(1e3 * exposure_s, 1)}
 
-    def look(self) -> None:
-        """After every frame."""
-        blur_px, exposure_s = self._px_per_px * self._exposure.blur_px, self._exposure.exposure_s
-        if not blur_px or exposure_s is None:
-            return
-        if self.summary is None:
-            self._warn(f"Shutter too slow: images blur by {blur_px:.0f} px")
-        if self.summary is None or blur_px > self.summary["blur_px"]:
-            self.summary = {"blur_px": round(blur_px, 1), "exposure_ms": round(1e3 * exposure_s, 1)}
 
-    @property
-    def sentence(self) -> str | None:
-        """For the reader of the scan; None where the images are sharp."""
-        if self.summary is None:
-            return None
-        px, ms = self.summary["blur_px"], self.summary["exposure_ms"]
-        return (
-            f"motion blurs the images by {px:.0f} px: the shutter is open for about {ms:.0f} ms, "
-            f"{ms / px:.1f} ms would blur by one; set a shorter exposure or fly slower"
-        )
+def slow_shutter(blur: Mapping[str, Any]) -> str:
+    """A :func:`motion_blur` for the reader of the scan."""
+    px, ms = blur["blur_px"], blur["exposure_ms"]
+    return (
+        f"motion blurs the images by {px:.0f} px: the shutter is open for about {ms:.0f} ms, "
+        f"{ms / px:.1f} ms would blur by one; set a shorter exposure or fly slower"
+    )

@@ -31,9 +31,9 @@ from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import ComputeConfig, Config
 from service.errors import InputError
-from service.flight.pipeline import Pipeline, baseline_of
+from service.flight.pipeline import Pipeline, spacing_of
 from service.flight.recorder import REPLAYED, TAGS_FILE, FrameTags, Recorder
-from service.flight.reports import ShutterWatch, TrackingWatch
+from service.flight.reports import TrackingWatch, motion_blur, slow_shutter
 from service.flight.telemetry_check import TelemetryCheck
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import covering
@@ -149,9 +149,7 @@ class Scan:
             inputs.config.camera, inputs.history, inputs.warn, inputs.latency_ms
         )
         self.tracking = TrackingWatch(inputs.warn)
-        odometry = self.mapper.odometry
-        coarser = float(inputs.camera.K[0, 0] / odometry.K[0, 0])
-        self.shutter = ShutterWatch(odometry.exposure, coarser, inputs.warn)
+        self._is_blur_reported = False
         self.tags = FrameTags(inputs.folder / TAGS_FILE) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
         self._photos: deque[None] = deque()  # one for each that was asked for
@@ -160,7 +158,7 @@ class Scan:
     def configure(self, config: Config, compute: ComputeConfig) -> None:
         """Apply the keys of ``config`` that change in flight, with the ``compute`` of its load."""
         self.check.set_camera(config.camera)
-        self.mapper.set_baseline(baseline_of(config.scan))  # from the next frame on
+        self.mapper.set_spacing(*spacing_of(config.scan))  # from the next frame on
         self.mapper.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
 
     def take_photo(self) -> None:
@@ -198,7 +196,7 @@ class Scan:
         assert isinstance(posed, FramePosed)
         self.check.add(time_ns, posed.frame)
         self.tracking.look(posed.frame, time_ns)
-        self.shutter.look()
+        self._report_blur()
         for doubt in self.pipeline.new_doubts():
             inputs.warn(doubt)
         self.recorder.write(events, state.alt_agl_m if state is not None else None)
@@ -208,6 +206,18 @@ class Scan:
         if inputs.on_frame is not None:
             inputs.on_frame(posed, state)
         return posed
+
+    @property
+    def motion_blur(self) -> dict[str, Any] | None:
+        """The strongest blur so far, fit for JSON; None while the images are sharp."""
+        odometry = self.mapper.odometry
+        return motion_blur(odometry.exposure, float(self.inputs.camera.K[0, 0] / odometry.K[0, 0]))
+
+    def _report_blur(self) -> None:
+        """Tell the operator once that the shutter is too slow for the speed."""
+        if not self._is_blur_reported and (blur := self.motion_blur) is not None:
+            self._is_blur_reported = True
+            self.inputs.warn(f"Shutter too slow: images blur by {blur['blur_px']:.0f} px")
 
     def _hand_out(self, frame: Frame, pose: Pose | None, agl_m: float | None) -> None:
         """A photo, tagged by telemetry, or by vision where telemetry does not tell."""
@@ -276,7 +286,7 @@ class Scan:
         extra["sigma_focal"] = round(max(self.inputs.sigma_focal, abs(self._focal_off())), 4)
         extra["focal_by_images"] = self._focal_by_images()
         extra["camera_readout"] = self._readout()
-        extra["motion_blur"] = self.shutter.summary
+        extra["motion_blur"] = self.motion_blur
         shutter = self.found_shutter()
         if shutter is not None:
             camera = self.store.header.camera | shutter_document(shutter)
@@ -294,11 +304,10 @@ class Scan:
     def found_shutter(self) -> Shutter | None:
         """The shutter by the images; None where it was not sought or is not sure."""
         search = self.mapper.odometry.readout
-        found = None if search is None else search.estimate
-        if found is None or not found.is_sure:
+        if search is None or not search.is_sure:
             return None
         camera = with_shutter(self.inputs.camera, self.inputs.config.camera)
-        return camera.shutter.reading(found.readout_s)
+        return camera.shutter.reading(search.readout_s)
 
     def _focal_off(self) -> float:
         """Share by which the images contradict the focal length; 0 where they do not."""
@@ -321,14 +330,13 @@ class Scan:
     def _readout(self) -> dict[str, Any] | None:
         """The readout by the images; None where it was not sought or does not show."""
         search = self.mapper.odometry.readout
-        found = None if search is None else search.estimate
-        if found is None:
+        if search is None or not search.windows:
             return None
         return {
-            "estimate_ms": round(1e3 * found.readout_s, 2),
-            "sigma_ms": round(1e3 * found.sigma_s, 2),
-            "windows": found.windows,
-            "is_sure": found.is_sure,
+            "estimate_ms": round(1e3 * search.readout_s, 2),
+            "sigma_ms": round(1e3 * search.sigma_s, 2),
+            "windows": search.windows,
+            "is_sure": search.is_sure,
         }
 
     def _assumed(self) -> list[str]:
@@ -356,8 +364,8 @@ class Scan:
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")
         if self.inputs.history is not None and self.tagged == 0 and self.recorder.frames:
             out.append("no frame lies inside the telemetry: poses rest on vision alone")
-        if self.shutter.sentence is not None:
-            out.append(self.shutter.sentence)
+        if (blur := self.motion_blur) is not None:
+            out.append(slow_shutter(blur))
         shutter = self.found_shutter()
         if shutter is not None and self.inputs.known is None:
             out.append(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
 from recon.types import F64, Pose, PosePrior
@@ -98,8 +98,7 @@ class _TimedTrajectory:
     """The trajectory as the reconstruction keeps it, and how long that took."""
 
     def __init__(self) -> None:
-        nodes = PoseGraphConfig(max_nodes=FusionConfig().graph_keyframes)
-        self.trajectory = Trajectory(graph=PoseGraph(nodes))
+        self.trajectory = Trajectory(graph=PoseGraph(FusionConfig().graph_keyframes))
         self.newest: Pose | None = None  # what tracking reads
         self.taken: list[float] = []  # ms of each keyframe: entered, placed, loops, corrections
         self.corrected: list[float] = []  # ms of each taken loop with its corrections

@@ -17,9 +17,9 @@ from trial_rig import Table
 from recon.posegraph import factors, pose_graph, records
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import REFIT_GROWTH, SETTLED_GROWTH
-from recon.posegraph.sensor_noise import PRECISE_TAU_S, TAUS_S
+from recon.posegraph.sensor_noise import ALTITUDE_S, ATTITUDE_S, FIX_S, PRECISE_TAU_S, TAUS_S
 from service.config import keys
 
 REPORTS = ROOT / "docs" / "reports"
@@ -89,17 +89,16 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
     kinds = re.findall(r'"([\w ]+)"', PoseGraph.residuals.__doc__ or "")
     assert len(kinds) == 11
     assert [kind for kind in kinds if f"`{kind}`" not in rows] == []
-    config = PoseGraphConfig()
     for words in (
         f"grown by {(REFIT_GROWTH - 1) * 100:.0f} % ({(SETTLED_GROWTH - 1) * 100:.0f} % from",
         f"block of {factors.BLOCK} keyframes",
-        f"({config.sigma_step} of its length)",
+        f"({factors.SIGMA_STEP} of its length)",
         f"{MIN_FIT_SIGMAS} sigmas. Fixes and attitudes beyond {WILD} sigmas",
-        f"claimed, inflated over {config.attitude_s:.0f} s",
-        f"claimed and inflated over {config.fix_s:.0f} s",
-        f"claimed, inflated over {config.altitude_s:.0f} s",
+        f"claimed, inflated over {ATTITUDE_S:.0f} s",
+        f"claimed and inflated over {FIX_S:.0f} s",
+        f"claimed, inflated over {ALTITUDE_S:.0f} s",
         f"\\sqrt{{{factors.BLOCK} \\cdot {factors.BLOCKS_PER_HEIGHT:.0f}}}",
-        f"{config.sigma_scale_walk} for {factors.BLOCK} keyframes; the first "
+        f"{factors.SIGMA_SCALE_WALK} for {factors.BLOCK} keyframes; the first "
         f"{factors.KNOWN_SCALE} to {factors.UNKNOWN_SCALE:.0f}",
         f"depths at a loop's ends | {factors.SIGMA_LOOP_SCALE} |",
         f"{factors.LINK_RAD} rad ({factors.LINK_WITHOUT_HEADING_RAD} without a heading); "

@@ -20,7 +20,7 @@ from recon.stereo.virtual_stereo import at_middle_row, rectify
 from recon.tracking import readout_search
 from recon.tracking.odometry import Odometry
 from recon.tracking.prediction import inverse_depth_plane
-from recon.tracking.readout_search import ReadoutEstimate, ReadoutSearch
+from recon.tracking.readout_search import ReadoutSearch
 from recon.types import DIRECTIONS, F64, U8, Camera, PosePrior, Shutter, StereoPair
 from service.config import Config
 from service.flight.scan import Scan, ScanInputs
@@ -314,6 +314,13 @@ def test_the_image_becomes_that_of_the_middle_row() -> None:
     assert at_middle_row(replace(view, rows=None), image) is image
 
 
+def found_by_images(readout_s: float, sigma_s: float, windows: int) -> ReadoutSearch:
+    """A search of which so many windows show a readout."""
+    search = ReadoutSearch(RowClock(PLAIN), PLAIN.K)
+    search.readout_s, search.sigma_s, search.windows = readout_s, sigma_s, windows
+    return search
+
+
 @pytest.mark.parametrize(("readout_s", "way", "expected"), [
     (0.02, "down", Shutter(0.02, "down")),
     (-0.02, "right", Shutter(0.02, "left")),
@@ -321,7 +328,7 @@ def test_the_image_becomes_that_of_the_middle_row() -> None:
 def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Shutter) -> None:
     def found(sigma_s: float) -> Shutter | None:
         scan = Mock(Scan, mapper=Mock(), inputs=Mock(ScanInputs))
-        scan.mapper.odometry.readout.estimate = ReadoutEstimate(readout_s, sigma_s, 3)
+        scan.mapper.odometry.readout = found_by_images(readout_s, sigma_s, 3)
         config = Config()
         scan.inputs.config = replace(config, camera=replace(config.camera, readout_ms="auto"))
         scan.inputs.camera = replace(PLAIN, shutter=Shutter(0.0, way))
@@ -331,7 +338,7 @@ def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Sh
     assert found(0.01) is None
 
 
-def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float | None]:
+def searched(readout_s: float, frames: int) -> tuple[ReadoutSearch, float | None]:
     """The readout that the odometry finds, from nothing, and the one it uses then; None: global."""
     ground = texture()
     odometry = Odometry(PLAIN, lens=PLAIN, seeks_readout=True)
@@ -341,9 +348,9 @@ def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float | No
         odometry.track(
             undistorted(photograph(ground, i / 15, readout_s), i, int(i * 1e9 / 15), prior)
         )
-    assert odometry.readout is not None and odometry.readout.estimate is not None
+    assert odometry.readout is not None and odometry.readout.windows
     rows = odometry.keyframes[-1].row_motion.rows
-    return odometry.readout.estimate, None if rows is None else rows.clock.readout_s
+    return odometry.readout, None if rows is None else rows.clock.readout_s
 
 
 @pytest.mark.parametrize(("readout_s", "frames"), [(0.02, 260), (-0.015, 140)])
@@ -412,11 +419,9 @@ def test_the_share_of_depth_is_what_the_rows_do_to_it(t: float) -> None:
 def test_the_doubt_about_a_readout_ends_when_it_is_found() -> None:
     search = ReadoutSearch(RowClock(PLAIN), PLAIN.K)
     assert search.is_open and search.doubt_s == readout_search.USUAL_S
-    search.estimate = ReadoutEstimate(0.012, 0.003, 1)  # seen, and not yet in use
+    search = found_by_images(0.012, 0.003, 1)  # and not yet in use
     assert not search.is_open and search.doubt_s == pytest.approx(np.hypot(0.012, 0.003))
-    search.estimate = ReadoutEstimate(0.001, 0.2, 1)
-    assert search.doubt_s == readout_search.USUAL_S
-    search.estimate = ReadoutEstimate(1e-4, 2e-4, 3)
-    assert search.doubt_s < 3e-4
+    assert found_by_images(0.001, 0.2, 1).doubt_s == readout_search.USUAL_S
+    assert found_by_images(1e-4, 2e-4, 3).doubt_s < 3e-4
     known = ReadoutSearch(RowClock(replace(PLAIN, shutter=Shutter(0.03))), PLAIN.K)
     assert known.doubt_s == 0.0 and not known.is_open

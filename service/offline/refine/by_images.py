@@ -32,7 +32,7 @@ from recon.calibration.global_bundle import Knowledge, Problem, Sightings, dispe
 from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.parallel import run_parallel
-from recon.posegraph.ground_control import Adjusted, ControlPoint, KeyframeTrack, Mark, map_position
+from recon.posegraph.ground_control import Adjusted, KeyframeTrack, Mark, Survey, map_position
 from recon.similarity import Similarity
 from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
@@ -199,7 +199,7 @@ def depth_scales(
 
 
 def adjusted(
-    images: ImageNetwork, track: KeyframeTrack, points: Sequence[ControlPoint],
+    images: ImageNetwork, track: KeyframeTrack, survey: Survey,
     marks: Sequence[Mark], surface: Surfaces,
 ) -> tuple[Adjusted, ImageNetwork]:  # fmt: skip
     """The adjustment with telemetry and surveyed points, and the network after it.
@@ -207,7 +207,7 @@ def adjusted(
     ``images`` is in the world of ``track``.
     """
     n, first = len(track.poses), len(images.points)
-    known = _known(images, track, points, {m.point for m in marks})
+    known = _known(images, track, survey, {m.point for m in marks})
     rows = [
         (_view_of(images, mark), first + mark.point, project(images.given.K, mark.ray[None]))
         for mark in marks
@@ -237,15 +237,13 @@ def _view_of(images: ImageNetwork, mark: Mark) -> int:
     return n + int(np.argmin(np.linalg.norm(images.poses[n:, :3, 3] - T[:3, 3], axis=1)))
 
 
-def _known(
-    images: ImageNetwork, track: KeyframeTrack, points: Sequence[ControlPoint], used: set[int]
-) -> Knowledge:
+def _known(images: ImageNetwork, track: KeyframeTrack, survey: Survey, used: set[int]) -> Knowledge:
     """Priors from telemetry, or from the flight's last georeference, and from the survey."""
-    n, first = len(track.poses), len(images.points)
-    out = Knowledge.none(len(images.poses), first + len(points))
+    n, first, (places_m, sigmas_m) = len(track.poses), len(images.points), survey
+    out = Knowledge.none(len(images.poses), first + len(places_m))
     for k in used:
-        out.surveyed[first + k] = points[k].position_m
-        out.sigma_surveyed[first + k] = np.maximum(points[k].sigma_m, 1e-3)
+        out.surveyed[first + k] = places_m[k]
+        out.sigma_surveyed[first + k] = np.maximum(sigmas_m[k], 1e-3)
     out.placed[:n] = track.poses
     if not track.priors:
         floor = np.diag([1e-8] * 3 + [1e-6] * 3)

@@ -22,9 +22,9 @@ from recon.parallel import run_parallel
 from recon.posegraph.ground_control import (
     SIGMA_SCALE,
     Adjusted,
-    ControlPoint,
     KeyframeTrack,
     Mark,
+    Survey,
     adjust,
     map_position,
     supported,
@@ -466,13 +466,13 @@ class _Refinement:
 
     def _adjusted(self, track: KeyframeTrack, candidates: Sequence[Candidate]) -> Adjusted:
         """The adjustment; control points that stay off are left out one by one, and named."""
-        points = _points(candidates)
+        survey = _survey(candidates)
         most = int(MAX_REFUSALS * sum(not c.point.is_check for c in candidates))
         while True:
             used = [c for c in candidates if c.is_control]
             marks = [m for c in used for m in c.marks]
             try:
-                found, images = self._solved(track, points, marks)
+                found, images = self._solved(track, survey, marks)
             except RuntimeError as error:  # so the solver says that the system is ill-posed
                 raise InputError(
                     "the poses of this scan contradict each other too much to be adjusted"
@@ -495,12 +495,12 @@ class _Refinement:
             worst.why_not = f"stays {far:.2f} m off after the adjustment"
 
     def _solved(
-        self, track: KeyframeTrack, points: Sequence[ControlPoint], marks: Sequence[Mark]
+        self, track: KeyframeTrack, survey: Survey, marks: Sequence[Mark]
     ) -> tuple[Adjusted, ImageNetwork | None]:
         """The adjustment, and where images are matched again their network after it."""
         if self.images is None:
-            return adjust(track, points, marks, self._sigma_scale()), None
-        return adjusted(self.images, track, points, marks, self.keyframe)
+            return adjust(track, survey, marks, self._sigma_scale()), None
+        return adjusted(self.images, track, survey, marks, self.keyframe)
 
     def _carried(self, one: Candidate, after: ImageNetwork | None) -> list[Mark]:
         """A point's marks, which move with the images."""
@@ -518,23 +518,22 @@ class _Refinement:
         used = [c for c in candidates if c.is_control]
         if len(used) <= MIN_OTHERS:
             return {}
-        points = _points(candidates)
+        survey = _survey(candidates)
         out: dict[str, list[float | None] | None] = {}
         for one in used:
             marks = [m for c in used if c is not one for m in c.marks]
-            found, images = self._solved(track, points, marks)
+            found, images = self._solved(track, survey, marks)
             place = map_position(found.poses, found.scales, self._carried(one, images))
             if place is not None:
                 out[one.point.name] = off_by(one, place[0])
         return out
 
 
-def _points(candidates: Sequence[Candidate]) -> list[ControlPoint]:
+def _survey(candidates: Sequence[Candidate]) -> Survey:
     """The surveyed points of ``candidates``, numbered alike."""
-    return [
-        ControlPoint(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m)
-        for c in candidates
-    ]
+    places = [np.zeros(3) if c.surveyed_m is None else c.surveyed_m for c in candidates]
+    sigmas = [c.sigma_m for c in candidates]
+    return np.reshape(places, (-1, 3)), np.reshape(sigmas, (-1, 3))
 
 
 Section = TypeVar("Section")

@@ -11,7 +11,6 @@ from some_views import view_at
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.pipeline.stages import plausible_depth
 from recon.pipeline.views import StereoView
-from recon.posegraph.records import PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.stereo.reprojection import plausible
 from recon.types import F64, U8, DepthMap, PosePrior
@@ -98,7 +97,7 @@ def test_nothing_left_is_no_depth() -> None:
 
 def test_a_segment_that_was_refuted_needs_more_views_that_agree() -> None:
     """Two views of a false motion contradict themselves; a third that does not stays out."""
-    rejected, segments = Counter[str](), Segments(PoseGraphConfig())
+    rejected, segments = Counter[str](), Segments()
 
     def stage(view: StereoView, depth: DepthMap) -> DepthMap | None:
         return plausible_depth(view, depth, np.zeros((*SHAPE, 3), np.uint8), segments, rejected)

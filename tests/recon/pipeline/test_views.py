@@ -14,18 +14,15 @@ from some_views import keyframe_at
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.pipeline.config import Baseline
-from recon.pipeline.views import (
-    ViewSelection,
-    VirtualStereoCamera,
-    frames_apart,
-)
+from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.frame import Frame, Landmarks, RelativePose, Tracking
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import Camera, PosePrior
+from service.config import ScanConfig
+from service.flight.pipeline import spacing_of
 
 
 def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Frame:
@@ -58,7 +55,7 @@ def stereo_camera(
     K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
     track = KnownTrack(keys, Mock(ExposureWatch, shown_s=shown_s), readout)
     return VirtualStereoCamera(
-        ViewSelection(Baseline()), cast(Odometry, track),
+        ViewSelection(), cast(Odometry, track),
         undistorter or Undistorter(Camera(K, np.zeros(5), size)), Counter(),
     )  # fmt: skip
 
@@ -93,14 +90,14 @@ def test_colour_is_undistorted_when_its_view_is_given_and_not_kept() -> None:
 
 
 def test_automatic_takes_the_odometrys_keyframes() -> None:
-    views = ViewSelection(Baseline())
+    views = ViewSelection()
     states = ["started", "tracked", "keyframe", "tracked", "keyframe"]
     taken = [offer(views, i, float(i), s) is not None for i, s in enumerate(states)]
     assert taken == [True, False, True, False, True]
 
 
 def test_partners_are_the_nearest_of_the_same_segment() -> None:
-    views = ViewSelection(Baseline(), partners=2)
+    views = ViewSelection(partners=2)
     offer(views, 0, 100.0, "started", segment=0)
     kept = [offer(views, 1 + i, 5.0 * i, "keyframe", segment=1) for i in range(4)]
     middle = kept[1]
@@ -112,13 +109,13 @@ def test_partners_are_the_nearest_of_the_same_segment() -> None:
 
 
 def test_two_views_alone_confirm_nothing() -> None:
-    views = ViewSelection(Baseline())
+    views = ViewSelection()
     first = offer(views, 0, 0.0, "started")
     offer(views, 1, 5.0, "keyframe")
     assert first is not None and not views.ready(first) and not views.confirmed(first)
     offer(views, 2, 10.0, "keyframe")
     assert views.ready(first) and views.confirmed(first)
-    fixed = ViewSelection(Baseline("metres", 2.0))
+    fixed = ViewSelection(spacing_m=2.0)
     left = offer(fixed, 0, 0.0, "started")
     offer(fixed, 1, 2.5, "tracked")
     assert left is not None and fixed.ready(left) and fixed.confirmed(left)
@@ -126,30 +123,25 @@ def test_two_views_alone_confirm_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("baseline", "seqs"),
-    [
-        (Baseline("frames", 2, 10), [0, 10, 20, 30]),
-        (Baseline("frames", 3, 10), [0, 5, 10]),
-    ],
+    [("2/10", [0, 10, 20, 30]), ("3/10", [0, 5, 10]), ("1/5", [0, 5, 10]), ("6/10", [0, 2, 4])],
 )
-def test_the_papers_notation_takes_every_so_many_frames(
-    baseline: Baseline, seqs: list[int]
-) -> None:
-    views = ViewSelection(baseline)
+def test_the_papers_notation_takes_every_so_many_frames(baseline: str, seqs: list[int]) -> None:
+    views = ViewSelection(*spacing_of(ScanConfig(baseline=baseline)))
     taken = [i for i in range(31) if offer(views, i, 0.1 * i, "keyframe" if i == 0 else "tracked")]
     assert taken[: len(seqs)] == seqs
 
 
 def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
-    views = ViewSelection(Baseline("metres", 2.0))
+    views = ViewSelection(spacing_m=2.0)
     taken = [i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")]
     assert taken == [0, 4, 8, 12, 16]
-    views.baseline = Baseline("metres", 1.0)
+    views.spacing_m = 1.0
     more = [i for i in range(20, 26) if offer(views, i, 0.5 * i, "tracked")]
     assert more == [20, 22, 24]
 
 
 def test_the_operator_can_ask_for_the_next_frame() -> None:
-    views = ViewSelection(Baseline())
+    views = ViewSelection()
     offer(views, 0, 0.0, "started")
     assert offer(views, 1, 0.1, "tracked") is None
     views.takes_next = True
@@ -157,12 +149,8 @@ def test_the_operator_can_ask_for_the_next_frame() -> None:
     assert offer(views, 3, 0.3, "tracked") is None
 
 
-def test_frames_apart() -> None:
-    assert frames_apart(2, 10) == 10 and frames_apart(1, 5) == 5 and frames_apart(6, 10) == 2
-
-
 def test_fewer_partners_from_now_on() -> None:
-    views = ViewSelection(Baseline(), partners=4)
+    views = ViewSelection(partners=4)
     kept = [offer(views, i, 5.0 * i, "started" if i == 0 else "keyframe") for i in range(5)]
     middle = kept[2]
     assert middle is not None
@@ -172,7 +160,7 @@ def test_fewer_partners_from_now_on() -> None:
 
 
 def test_blurred_views_are_no_partners() -> None:
-    views = ViewSelection(Baseline(), partners=2)
+    views = ViewSelection(partners=2)
     kept = [
         offer(views, i, 5.0 * i, "keyframe" if i else "started", blurred=i == 1) for i in range(5)
     ]
@@ -181,7 +169,7 @@ def test_blurred_views_are_no_partners() -> None:
 
 
 def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None:
-    views = ViewSelection(Baseline())
+    views = ViewSelection()
     for i in range(3):
         for j in range(10):
             state = "tracked" if j else "keyframe" if i else "started"
@@ -191,22 +179,22 @@ def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None
     last = frame(28, 14.0)
     assert views.end_stretch(last) and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
     assert not views.end_stretch(None) and len(views.partners(last)) == 4
-    fixed = ViewSelection(Baseline("metres", 2.0))
+    fixed = ViewSelection(spacing_m=2.0)
     for i in range(3):
         offer(fixed, i, 2.5 * i, "tracked" if i else "started")
     assert not fixed.end_stretch(frame(3, 6.5))
 
 
 def test_all_frames_count_where_the_operator_chose_the_baseline_or_wants_the_next_one() -> None:
-    assert ViewSelection(Baseline("metres", 2.0)).frames_per_step == np.inf
-    assert ViewSelection(Baseline("frames", 2, 10)).frames_per_step == np.inf
-    views = ViewSelection(Baseline())
+    assert ViewSelection(spacing_m=2.0).frames_per_step == np.inf
+    assert ViewSelection(spacing_frames=10).frames_per_step == np.inf
+    views = ViewSelection()
     views.takes_next = True
     assert views.frames_per_step == np.inf
 
 
 def test_as_many_frames_are_needed_as_pair_up() -> None:
-    few, many = ViewSelection(Baseline(), partners=4), ViewSelection(Baseline(), partners=30)
+    few, many = ViewSelection(partners=4), ViewSelection(partners=30)
     assert np.isfinite(few.frames_per_step)
     steps_with_partners = 2.2 - 0.6  # ahead of the first view
     assert many.frames_per_step * steps_with_partners >= 30

@@ -12,7 +12,7 @@ from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loops, over_gaps, surplus, thinned
 from recon.posegraph.trajectory import Trajectory
@@ -46,7 +46,7 @@ def fly(trajectory: Trajectory, first: int = 0, count: int = COUNT, fixes: bool 
 
 
 def bounded() -> PoseGraph:
-    return PoseGraph(PoseGraphConfig(max_nodes=MOST))
+    return PoseGraph(MOST)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 
@@ -46,7 +46,7 @@ def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
     units = np.array([1.0] * 3 + [1.0 / hard.scale] * 3)
     truth = legs(rng, hard.count, hard.leg, hard.step_m)
     odom, priors = sensed(rng, truth, SPREAD, hard.scale)
-    trajectory = Trajectory(graph=PoseGraph(PoseGraphConfig(max_nodes=hard.nodes)))
+    trajectory = Trajectory(graph=PoseGraph(hard.nodes))
     segment, start, time_ns = 0, 0, 0
     for i, prior in enumerate(heard(hard, rng, truth, priors)):
         if i and rng.random() < 1.0 / hard.segment:

@@ -11,7 +11,7 @@ from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loop, surplus, thinned
 from recon.posegraph.trajectory import Trajectory
@@ -32,7 +32,7 @@ def flight() -> tuple[list[F64], list[F64], list[PosePrior]]:
 
 
 def bounded(most: int = MOST) -> PoseGraph:
-    return PoseGraph(PoseGraphConfig(max_nodes=most))
+    return PoseGraph(most)
 
 
 def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph import ground_control
-from recon.posegraph.ground_control import ControlPoint, KeyframeTrack, Mark, adjust, map_position
+from recon.posegraph.ground_control import KeyframeTrack, Mark, adjust, map_position
 from recon.posegraph.records import Loop
 from recon.posegraph.smoother import State
 from recon.similarity import umeyama
@@ -81,9 +81,9 @@ def test_five_control_points_bring_the_map_to_its_place(with_depth: bool) -> Non
     truth = true_poses()
     before = moved(drifted(truth), np.array([1.2, -0.8, 2.0]), np.array([0.004, -0.003, 0.01]))
     track = KeyframeTrack(before, TIMES, loose(40))
-    points = [ControlPoint(P, SURVEY) for P in SPOTS]
+    survey = SPOTS, np.tile(SURVEY, (len(SPOTS), 1))
     marks = marks_of(truth, SPOTS, with_depth=with_depth)
-    found = adjust(track, points, marks)
+    found = adjust(track, survey, marks)
     assert rms(before, truth) > 2.0
     assert rms(found.poses, truth) < 0.25
     checks = marks_of(truth, CHECKS, seed=5)
@@ -97,9 +97,9 @@ def test_a_wrong_scale_is_found() -> None:
     truth = true_poses()
     before = drifted(truth, scale=1 / 1.03)
     track = KeyframeTrack(before, TIMES, loose(40))
-    points = [ControlPoint(P, SURVEY) for P in SPOTS]
+    survey = SPOTS, np.tile(SURVEY, (len(SPOTS), 1))
     marks = marks_of(truth, SPOTS, depth_scale=1.03)
-    found = adjust(track, points, marks)
+    found = adjust(track, survey, marks)
     assert found.scales == pytest.approx(1.03, abs=0.004)
     assert rms(found.poses, truth) < 0.25
 
@@ -111,10 +111,10 @@ def test_covariances_cover_the_errors() -> None:
         rng = np.random.default_rng(100 + seed)
         shift = rng.normal(0, 1.5, 3)
         before = moved(drifted(truth, seed), shift, rng.normal(0, 0.01, 3))
-        survey = SPOTS + rng.normal(size=SPOTS.shape) * SURVEY
-        points = [ControlPoint(P, SURVEY) for P in survey]
+        places = SPOTS + rng.normal(size=SPOTS.shape) * SURVEY
+        survey = places, np.tile(SURVEY, (len(SPOTS), 1))
         track = KeyframeTrack(before, TIMES, loose(40))
-        found = adjust(track, points, marks_of(truth, SPOTS, seed))
+        found = adjust(track, survey, marks_of(truth, SPOTS, seed))
         for k in range(0, 40, 5):
             error = se3.log(truth[k] @ se3.inverse(found.poses[k]))
             whitened.append(error @ np.linalg.solve(found.covariances[k], error))
@@ -129,8 +129,8 @@ def test_marks_between_keyframes_count_alike() -> None:
     marks = []
     for m in marks_of(np.array([T @ nearby for T in truth]), SPOTS, with_depth=False):
         marks.append(Mark(m.point, m.keyframe, m.ray, m.sigma, None, 1.0, nearby))
-    points = [ControlPoint(P, SURVEY) for P in SPOTS]
-    found = adjust(KeyframeTrack(before, TIMES, loose(40)), points, marks)
+    survey = SPOTS, np.tile(SURVEY, (len(SPOTS), 1))
+    found = adjust(KeyframeTrack(before, TIMES, loose(40)), survey, marks)
     assert rms(found.poses, truth) < 0.25
 
 

@@ -19,7 +19,6 @@ from recon.posegraph.level_ground import (
     ASSUMED_TILT_RAD,
     LEVEL_SIGMA_RAD,
     levelled,
-    plane_normal,
 )
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
@@ -79,7 +78,6 @@ def test_a_known_attitude_and_a_slope_below_the_camera_stay() -> None:
 def test_ground_without_a_plane_levels_nothing() -> None:
     assert levelled(NADIR, ground_seen(looking(-40), relief_m=150.0)) is NADIR
     assert levelled(NADIR, ground_seen(looking(-40))[:20]) is NADIR
-    assert plane_normal(np.zeros((100, 3))) is None
 
 
 @pytest.mark.parametrize(("steep", "is_levelled"), [(1, False), (2, False), (3, True), (10, True)])

@@ -13,18 +13,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from recon import parallel, se3
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.sensor_noise import BIAS_TAU_S
 from recon.posegraph.smoother import NO_SCALE, Smoother, State, System
 from recon.posegraph.trajectory import Trajectory
 from recon.similarity import umeyama
 from recon.types import F64, Pose, PosePrior
 
 STEP_M = 6.0
-# The noise of these flights is white, unlike real sensors', and their scale does not drift.
-WHITE = PoseGraphConfig(
-    fix_s=0.0, attitude_s=0.0, altitude_s=0.0, sigma_step=1e-4,
-    sigma_scale_walk=1e-4,
-)  # fmt: skip
+# The noise of these flights is white, unlike real sensors'.
+WHITE = 0.0, 0.0, 0.0
 
 
 @dataclass
@@ -73,10 +71,10 @@ def flight(
 
 
 def fly(
-    f: Flight, config: PoseGraphConfig = WHITE, altitude_bias_m: float | None = None
+    f: Flight, bias_tau_s: tuple[float, float, float] = WHITE, altitude_bias_m: float | None = None
 ) -> tuple[PoseGraph, Pose]:
     """The graph after the whole flight and its last pose."""
-    graph = PoseGraph(config)
+    graph = PoseGraph(bias_tau_s=bias_tau_s)
     rng = np.random.default_rng(99)
     pose = None
     for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
@@ -307,7 +305,7 @@ def test_a_hover_of_an_hour_bends_nothing() -> None:
 @pytest.mark.slow
 def test_a_stretch_without_vision_is_bridged_and_said() -> None:
     f, later = flight(120), flight(120, scale=0.6)
-    graph = PoseGraph(WHITE)
+    graph = PoseGraph(bias_tau_s=WHITE)
     for i in range(50):
         graph.add_keyframe(i, i * 10**9, 0, f.odom[i], f.covariance, f.priors[i])
     for i in range(56, 120):
@@ -515,7 +513,7 @@ def test_errors_that_are_new_in_each_fix_average_out() -> None:
 
 def offset_and_sigma(f: Flight) -> tuple[F64, F64]:
     """(3,) mean offset of the track from the truth, and the (3,) sigma of a place, in m."""
-    graph, _ = fly(f, PoseGraphConfig())
+    graph, _ = fly(f, BIAS_TAU_S)
     graph.solve()
     track = Trajectory(graph=graph)
     off, sigma = [], []
@@ -560,7 +558,7 @@ def test_vision_and_loops_that_contradict_each_other_leave_the_scale_to_the_fixe
     """All err by ten of their sigmas, so a smaller map would agree better in metres."""
     f = flight(130, seed=seed, sigma_gnss_m=2.0, drift=0.01)
     f.covariance = f.covariance / 10.0**2
-    graph, _ = fly(f, PoseGraphConfig())
+    graph, _ = fly(f, BIAS_TAU_S)
     rng = np.random.default_rng(seed)
     spread = np.diag([1e-3**2] * 3 + [0.05**2] * 3)
     for i in range(8):
@@ -638,7 +636,7 @@ def test_a_rebuild_gives_way_to_threads_that_wait(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.slow
 def test_readings_that_cannot_be_are_left_out(fault: dict[str, Any]) -> None:
     f = flight(30)
-    graph = PoseGraph(WHITE)
+    graph = PoseGraph(bias_tau_s=WHITE)
     for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
         prior = replace(prior, **fault) if i % 5 == 0 else prior
         graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, (60.0 / 1.3, 0.0))

@@ -17,7 +17,7 @@ from recon.stereo.virtual_stereo import drop_unseen, rectify
 from recon.tracking.motion_blur import ExposureWatch, streak_px
 from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Camera, PosePrior, StereoPair
-from service.flight.reports import ShutterWatch
+from service.flight.reports import motion_blur, slow_shutter
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 360))
@@ -98,9 +98,8 @@ def pose(t_s: float) -> F64:
 @pytest.mark.slow
 def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
     ground, exposure_s = painted_ground(), 0.05
-    odometry, warnings = Odometry(CAMERA), list[str]()
-    watch = ShutterWatch(odometry.exposure, 2.0, warnings.append)
-    assert watch.sentence is None
+    odometry = Odometry(CAMERA)
+    assert motion_blur(odometry.exposure, 2.0) is None
     for i in range(int(5 * FPS)):
         t = i / FPS
         moments = t + exposure_s * np.linspace(-0.5, 0.5, 7)
@@ -109,12 +108,10 @@ def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
         T = pose(t)
         prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 2.0)
         odometry.track(undistorted(gray, i, round(1e9 * t), prior))
-        watch.look()
-    (text,) = warnings
-    assert text.startswith("Shutter too slow: images blur by ") and len(text) <= 50
-    assert watch.summary is not None and watch.sentence is not None
-    assert watch.summary["exposure_ms"] == pytest.approx(50.0, rel=0.3)
-    assert watch.summary["blur_px"] > 10.0, "px of the recording, twice as fine"
+    blur = motion_blur(odometry.exposure, 2.0)
+    assert blur is not None and blur["exposure_ms"] == pytest.approx(50.0, rel=0.3)
+    assert blur["blur_px"] > 10.0, "px of the recording, twice as fine"
+    assert f"images by {blur['blur_px']:.0f} px" in slow_shutter(blur)
 
 
 def shot(T_world_camera: F64, blur_px: F64) -> U8:

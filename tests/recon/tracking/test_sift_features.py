@@ -1,6 +1,8 @@
-"""Features of images: the largest first, remembered for a while, compared by their look."""
+"""Features of images: the largest first, kept by their frame, compared by their look."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,9 +10,9 @@ import pytest
 from painted_ground import pose, still
 
 from recon.tracking import sift_features
+from recon.tracking.frame import NO_IMAGE, Frame
+from recon.tracking.localisation import match_images
 from recon.tracking.sift_features import (
-    FeatureCache,
-    Features,
     alike,
     features,
     mutual,
@@ -46,20 +48,6 @@ def test_features_stay_where_they_are_in_an_image_upside_down(share: int) -> Non
     assert np.abs(np.median(same, axis=0)).max() < 0.05 * share
 
 
-def test_a_cache_forgets_what_was_not_asked_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[int] = []
-
-    def counted(gray: U8, *_: int) -> Features:
-        made.append(int(gray[0, 0]))
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), 16)
-
-    monkeypatch.setattr(sift_features, "features", counted)
-    cache = FeatureCache(kept=2)
-    for number in (0, 1, 0, 2, 0, 1):
-        cache.of(number, np.full((16, 16), number, np.uint8))
-    assert made == [0, 1, 2, 1]
-
-
 def test_a_look_is_that_of_the_place_whatever_the_turn() -> None:
     here, turned, elsewhere = (
         signature(still(T)) for T in (pose(0.0), pose(6.0, 130.0, seed=1), pose(80.0))
@@ -85,12 +73,25 @@ def textured(shared_px: float, own_px: float, own: float) -> list[U8]:
 
 @pytest.mark.slow
 def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> None:
-    a, b = enumerate(textured(shared_px=1.8, own_px=8.0, own=20.0))
-    cache = FeatureCache()
-    assert cache.match_features(a, b, low_frame_rate=False) is None
-    view = cache.match_features(a, b, low_frame_rate=True)
+    a, b = (
+        Frame(NO_IMAGE, 0, seq, pyramid=(image,))
+        for seq, image in enumerate(textured(shared_px=1.8, own_px=8.0, own=20.0))
+    )
+    assert match_images(a, b, low_frame_rate=False) is None
+    view = match_images(a, b, low_frame_rate=True)
     assert view is not None
     np.testing.assert_allclose(view.carry(np.array([[640.0, 360.0]])), [[540.0, 360.0]], atol=2.0)
+
+
+def test_a_frame_keeps_its_features() -> None:
+    a, b = (
+        Frame(NO_IMAGE, 0, seq, pyramid=(still(pose(dx)),)) for seq, dx in enumerate((0.0, 6.0))
+    )
+    found = match_images(a, b, low_frame_rate=False)
+    a, b = (replace(image, pyramid=()) for image in (a, b))
+    again = match_images(a, b, low_frame_rate=False)
+    assert found is not None and again is not None
+    np.testing.assert_array_equal(again.uv_a, found.uv_a)
 
 
 def test_masses_tie_images_whose_leaves_differ() -> None:

@@ -19,7 +19,7 @@ from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph import pieces
 from recon.posegraph.alignment_readings import Alignment
-from recon.posegraph.records import Loop, PoseGraphConfig
+from recon.posegraph.records import Loop
 from recon.posegraph.segments import Segment, Segments
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
@@ -77,7 +77,7 @@ def apart(
     ties: Ties, points: tuple[int, ...] = (100, 300, 200, 50), prior: PosePrior = NOWHERE
 ) -> list[tuple[int, int]]:
     """What is apart of four segments with so many points in each keyframe."""
-    segments = Segments(PoseGraphConfig())
+    segments = Segments()
     for number, count in enumerate(points):
         segment = ties.segment(segments, number)
         for i in range(3):
@@ -134,7 +134,7 @@ def test_a_forgotten_loop_still_ties() -> None:
 
 def test_a_segment_without_nodes_is_tied_as_it_was() -> None:
     """A long flight drops the nodes of short segments; their keyframes stay as published."""
-    segments = Segments(PoseGraphConfig())
+    segments = Segments()
     for number, count in enumerate((300, 100, 100)):
         segment = Ties(fixed=(1,)).segment(segments, number)
         segment.add_surface(10 * number, count, NOWHERE)
