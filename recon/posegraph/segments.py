@@ -192,10 +192,11 @@ class Segments:
             placed = replace(placed, covariance=before.covariance, sources=before.sources)
         known = (found for _, found in self._placed() if found.sigma_fixes is not None)
         other = next(known, placed)  # one receiver places all that loops join
-        segment.similarity = replace(
-            placed, sigma_fixes=other.sigma_fixes, sigma_counted=other.sigma_counted
-        )
-        segment.is_tied_by_loop = True
+        placed = replace(placed, sigma_fixes=other.sigma_fixes, sigma_counted=other.sigma_counted)
+        segment.similarity, segment.is_tied_by_loop = placed, True
+        # Its sensors' own constants were those from the similarity before.
+        readings = self._without_constants(segment, segment.constants)
+        segment.offsets = with_offsets(segment.constants, readings, placed)
 
     def refit(self, segment: Segment, pose: Callable[[int], F64]) -> bool:
         """True when the segment's similarity was fitted again, which is due as the segment grows.

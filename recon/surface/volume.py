@@ -108,21 +108,8 @@ def _voted(upper: Raster, ground_m: F32, depths: Sequence[DepthMap]) -> Volume:
     origin = np.array(
         [grid.west_m + 0.5 * grid.cell_m, grid.north_m - (rows - 0.5) * grid.cell_m, base_m]
     )
-    inside, span_m = np.isfinite(_tiles(height)), SIDE * grid.cell_m
-    has, near = inside.any(axis=(2, 3)), np.ones((3, 3), np.uint8)
-    low_m, ground_m, high_m = (
-        pick(_tiles(one), axis=(2, 3), where=np.isfinite(_tiles(one)), initial=far)
-        for one, pick, far in (
-            (height, np.min, np.inf), (ground_m, np.min, np.inf), (height, np.max, -np.inf),
-        )
-    )  # fmt: skip
-    low_m = np.where(has, cv2.erode(low_m, near, borderValue=np.inf), 0.0)
-    high_m = np.where(has, cv2.dilate(high_m, near, borderValue=-np.inf), -np.inf)
-    lowest, deepest = (
-        np.floor((one - base_m) / span_m - 0.5).astype(np.int32)
-        for one in (low_m, np.minimum(low_m, ground_m))
-    )
-    highest = np.where(has, np.floor((high_m - base_m) / span_m + 0.5), lowest - 1).astype(np.int32)
+    inside = np.isfinite(_tiles(height))
+    lowest, highest, deepest = _layers(height, ground_m, base_m, SIDE * grid.cell_m)
     truncation_m = _truncation(depths, grid.cell_m)
     added, parts = _blocks(lowest, highest), []
     if len(added) > LARGEST_BLOCKS:
@@ -153,6 +140,26 @@ def _voted(upper: Raster, ground_m: F32, depths: Sequence[DepthMap]) -> Volume:
         for name in ("block", "distance", "weight")
     )
     return Volume(origin, grid.cell_m, inside, block, distance, weight)
+
+
+def _layers(height: F32, ground_m: F32, base_m: float, span_m: float) -> tuple[I32, I32, I32]:
+    """(Y, X) lowest and highest block that a surface passes through, counted from ``base_m`` by
+    ``span_m``, and the lowest that images may move it to."""
+    has, near = np.isfinite(_tiles(height)).any(axis=(2, 3)), np.ones((3, 3), np.uint8)
+    low_m, ground_m, high_m = (
+        pick(_tiles(one), axis=(2, 3), where=np.isfinite(_tiles(one)), initial=far)
+        for one, pick, far in (
+            (height, np.min, np.inf), (ground_m, np.min, np.inf), (height, np.max, -np.inf),
+        )
+    )  # fmt: skip
+    low_m = np.where(has, cv2.erode(low_m, near, borderValue=np.inf), 0.0)
+    high_m = np.where(has, cv2.dilate(high_m, near, borderValue=-np.inf), -np.inf)
+    lowest, deepest = (
+        np.floor((one - base_m) / span_m - 0.5).astype(np.int32)
+        for one in (low_m, np.minimum(low_m, ground_m))
+    )
+    highest = np.where(has, np.floor((high_m - base_m) / span_m + 0.5), lowest - 1).astype(np.int32)
+    return lowest, highest, deepest
 
 
 def _tiles(cells: F32) -> F32:

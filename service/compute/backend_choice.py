@@ -52,7 +52,9 @@ class FallbackBackend:
 
     def __getattr__(self, name: str) -> Any:
         """What the backend has under this name; an operation falls back."""
-        found = getattr(self.__dict__["_backend"], name)
+        if name == "_backend":  # while it is copied
+            raise AttributeError(name)
+        found = getattr(self._backend, name)
         return partial(self._run, name) if callable(found) else found
 
     def fail(self, error: Exception) -> None:

@@ -73,6 +73,10 @@ class Refly:
     def length_m(self) -> float:
         return _length_m(self.lines.reshape(-1, 2))
 
+    @property
+    def seconds(self) -> int:
+        return round(self.length_m / max(self.swath.speed_m_s, 1.0))
+
 
 def _length_m(places: F64) -> float:
     """Of the way along (N, 2) places."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import pickle
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +140,16 @@ def test_a_lost_device_falls_back_to_the_cpu(caplog: pytest.LogCaptureFixture) -
     assert backend.name == backend.device == "cpu"
     assert backend.failure == "CUDA out of memory"
     assert "the CPU takes over" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda b: pickle.loads(pickle.dumps(b))]
+)
+def test_a_backend_with_the_cpu_in_reserve_can_be_copied(copied: Callable[[Any], Any]) -> None:
+    backend = copied(FallbackBackend(CpuBackend()))
+    assert backend.name == "cpu" and backend.failure is None
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = backend.nothing
 
 
 def test_auto_takes_the_fastest_that_works() -> None:
