@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 
 from numba import config
 
+from recon.compiled import keep_packed
+
 T = TypeVar("T")
 
 RELEASE_S = 1e-4
@@ -23,6 +25,8 @@ RELEASE_S = 1e-4
 
 CELLS_PER_THREAD = 1 << 20
 """Cells of a cost volume that are worth a thread: half a millisecond of simple work."""
+
+keep_packed()  # before the first kernel is loaded
 
 _limit = 0  # threads that one call may use; 0: one per core
 

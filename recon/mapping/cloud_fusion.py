@@ -44,17 +44,17 @@ def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
     are islands of mostly single-view points above or below such surface. Order is that of the
     voxel keys (x first), whatever the order of points in a cloud.
     """
-    return fuse_strips([lambda: clouds], [-np.inf, np.inf], voxel_m)
+    return without_contradicted(*fuse_strips([lambda: clouds], [-np.inf, np.inf], voxel_m))
 
 
 def fuse_strips(
     strips: Sequence[Callable[[], Iterable[PointCloud]]], edges_m: Sequence[float], voxel_m: float
-) -> PointCloud:
-    """As :func:`fuse`, in strips of x, so that the sums of one per core are held.
+) -> _Fused:
+    """The means of :func:`fuse`, in strips of x, so that the sums of one per core are held.
 
     ``strips[n]`` gives the clouds that reach into ``edges_m[n] <= x < edges_m[n + 1]``; their
     points outside are skipped. Finite edges are moved to the voxel border below them, so the result
-    is that of the whole.
+    is that of the whole. :func:`without_contradicted` then leaves out what ``fuse`` does.
     """
     borders = np.floor(np.asarray(edges_m, np.float64) / voxel_m)
 
@@ -68,12 +68,16 @@ def fuse_strips(
 
     rows = zip(strips, borders[:-1], borders[1:], strict=True)
     found = run_parallel(*(partial(fused, *row) for row in rows))
-    keys, whole = np.concatenate([of[0] for of in found]), joined([of[1] for of in found])
-    del found  # as large as the whole
-    lone = np.zeros(len(whole), np.bool_)
-    parallel_for(_lone_contradicted, len(lone), keys, whole.xyz_m, whole.sigma_m, whole.views, lone)
-    lone |= _islands(keys, whole.views)
-    return whole if not lone.any() else without(whole, lone)
+    return np.concatenate([of[0] for of in found]), joined([of[1] for of in found])
+
+
+def without_contradicted(keys: I64, means: PointCloud) -> PointCloud:
+    """The ``means`` of :func:`fuse_strips` less the lone points and islands that :func:`fuse`
+    leaves out."""
+    lone = np.zeros(len(means), np.bool_)
+    parallel_for(_lone_contradicted, len(lone), keys, means.xyz_m, means.sigma_m, means.views, lone)
+    lone |= _islands(keys, means.views)
+    return means if not lone.any() else without(means, lone)
 
 
 def _first_of_each(times_ns: Sequence[I64 | None]) -> I64 | None:

@@ -143,14 +143,14 @@ def round_cell(cell_m: float, up: bool = False) -> float:
     return round(power * max(n for n in ROUND if n <= ratio + 1e-6), 9)
 
 
-def grid_over(xy_m: F64, cell_m: float, margin_cells: int = 0) -> Grid:
+def grid_over(xy_m: F64 | F32, cell_m: float, margin_cells: int = 0) -> Grid:
     """The grid of ``cell_m`` that covers (N, 2) points, its edges on multiples of the cell."""
-    xy = np.asarray(xy_m, np.float64)
+    xy = np.asarray(xy_m)
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise ValueError(f"expected points of shape (N, 2) with N > 0, got {xy.shape}")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        low = np.floor(np.array([c.min() for c in xy.T]) / cell_m) - margin_cells
-        high = np.floor(np.array([c.max() for c in xy.T]) / cell_m) + 1 + margin_cells
+        low = np.floor(np.array([c.min() for c in xy.T], np.float64) / cell_m) - margin_cells
+        high = np.floor(np.array([c.max() for c in xy.T], np.float64) / cell_m) + 1 + margin_cells
         cells = float(np.prod(high - low))
     if not cells <= min(LARGEST_CELLS, max(MIN_CELLS, CELLS_PER_POINT * len(xy))):
         raise ValueError(_too_large(high[1] - low[1], high[0] - low[0]))
@@ -358,7 +358,8 @@ def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
     out = np.empty_like(raster.height_m)
     for band, own in _bands(len(out), margin=8):
         out[band][own] = _smoothed(raster.height_m[band] - middle, tolerance, sigma_cells)[own]
-    return replace(raster, height_m=out + middle)
+    out += middle
+    return replace(raster, height_m=out)
 
 
 def _smoothed(height_m: F32, tolerance_m: float, sigma_cells: float) -> F32:

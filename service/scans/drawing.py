@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +34,7 @@ MIN_LINE_PX = 640
 SIGN_PX = 500
 """Panels this large have labels of their usual size; on larger ones labels grow, as pages show a
 panel about this large."""
-PAINTED_ROWS = 128
+PAINTED_ROWS, COUNTED = 128, 1 << 18
 
 
 class Maps(NamedTuple):
@@ -69,16 +69,18 @@ def draw_maps(
     The longer side is at most ``largest_px``; ``height_of_zero_m`` is added to heights in labels.
     """
     shown = fill_holes(raster)
+    ends = _height_range(shown)
     shade = _relief(shown)
+    shown = replace(shown, sigma_m=raster.sigma_m)  # that of the filled is no longer needed
     lit = shade if is_shaded else np.ones_like(shade)
     colour = _fit(_painted(shown, _colours(shown, lit)), largest_px)
-    height = _fit(_painted(shown, _heights(shown, shade)), largest_px)
+    height = _fit(_painted(shown, _heights(shown, ends, shade)), largest_px)
     scale = _scale(raster.grid.shape, largest_px)
     for panel in (colour, height):
         _draw_track(panel, raster.grid, track_m, scale)
         _draw_scale_bar(panel, raster.grid.cell_m / scale)
         _draw_north(panel)
-    _draw_height_legend(height, shown, height_of_zero_m)
+    _draw_height_legend(height, [end + height_of_zero_m for end in ends])
     return Maps(colour, height, raster.grid.cell_m)
 
 
@@ -113,9 +115,9 @@ def blank_preview(lines: Sequence[str]) -> U8:
 
 def _relief(raster: Raster) -> F32:
     """Shading of the smoothed surface, about 1 on level ground; NaN where unknown."""
-    level = math.sin(math.radians(45.0))
     shade = hillshade(smoothed(raster).height_m, raster.grid.cell_m)
-    return np.asarray(shade / level, np.float32)
+    shade /= math.sin(math.radians(45.0))
+    return shade
 
 
 def _colours(raster: Raster, shade: F32) -> Callable[[slice], F32]:
@@ -137,8 +139,10 @@ def _gain(raster: Raster) -> float:
 
 
 def values(rgb: U8) -> Array:
-    """(256,) how often each value occurs in colours."""
-    return np.bincount(rgb.ravel(), minlength=256)
+    """(256,) how often each value occurs in colours, some at a time: counting takes eight times
+    their memory."""
+    parts = np.array_split(rgb.ravel(), 1 + rgb.size // COUNTED)
+    return np.sum([np.bincount(part, minlength=256) for part in parts], axis=0)
 
 
 def exposure(counts: Array) -> float:
@@ -147,9 +151,9 @@ def exposure(counts: Array) -> float:
     return float(np.clip(230.0 / max(bright, 1), 1.0, 2.0))
 
 
-def _heights(raster: Raster, shade: F32) -> Callable[[slice], F32]:
-    """Paints rows in height as hue times shading."""
-    low, high = _height_range(raster)
+def _heights(raster: Raster, ends: Sequence[float], shade: F32) -> Callable[[slice], F32]:
+    """Paints rows in height as hue times shading; ``ends`` are those of the colour scale."""
+    low, high = ends
 
     def paint(rows: slice) -> F32:
         unit = (np.nan_to_num(raster.height_m[rows], nan=low) - low) / (high - low)
@@ -180,7 +184,7 @@ def _painted(raster: Raster, paint: Callable[[slice], F32]) -> U8:
         rows = slice(top, top + PAINTED_ROWS)
         bgr = paint(rows)
         out[rows] = np.clip(bgr, 0, 255, out=bgr)
-    out[~raster.known] = BACKGROUND
+        out[rows][~raster.known[rows]] = BACKGROUND
     return out
 
 
@@ -252,9 +256,9 @@ def _draw_north(panel: U8) -> None:
     _text(panel, "N", (x - round(5 * grown), word), 0.45 * grown)
 
 
-def _draw_height_legend(panel: U8, raster: Raster, height_of_zero_m: float) -> None:
+def _draw_height_legend(panel: U8, ends_m: Sequence[float]) -> None:
     """The colour scale with its two heights."""
-    low, high = _height_range(raster)
+    low, high = ends_m
     grown = _growth(panel)
     edge, wide, words = (round(v * grown) for v in (12, 10, 28))
     length = min(round(120 * grown), panel.shape[0] // 3)
@@ -262,8 +266,8 @@ def _draw_height_legend(panel: U8, raster: Raster, height_of_zero_m: float) -> N
     bar = 0.25 * 255 + 0.75 * cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS).astype(np.float32)
     panel[edge : edge + length, edge : edge + wide] = bar.astype(np.uint8)
     top = edge + wide
-    _text(panel, f"{high + height_of_zero_m:.1f} m", (words, top), 0.4 * grown)
-    _text(panel, f"{low + height_of_zero_m:.1f} m", (words, edge + length), 0.4 * grown)
+    _text(panel, f"{high:.1f} m", (words, top), 0.4 * grown)
+    _text(panel, f"{low:.1f} m", (words, edge + length), 0.4 * grown)
 
 
 def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 from recon.mapping.cloud_fusion import joined
 from recon.parallel import run_parallel
 from recon.surface.raster import Raster, grid_over, rasterise
-from recon.types import PointCloud
+from recon.types import U8, PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.memory import release_memory
 from service.progress import CancelledError, Progress
@@ -262,26 +262,27 @@ class _Files:
             if self._raster is not None:
                 maps = maps_of(summary, poses, self._raster)
             lines = [*key_figures(summary), *filter(None, [self._left_out])]
-            image = (
-                drawing.blank_preview(lines) if maps is None else drawing.side_by_side(maps, lines)
+            self._write_image(
+                PREVIEW,
+                drawing.blank_preview(lines) if maps is None else drawing.side_by_side(maps, lines),
+                [cv2.IMWRITE_JPEG_QUALITY, 90],
             )
-            coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
-            write_whole(self._folder / PREVIEW, coded.tobytes())
         if self._raster is not None:
             with self.failures.noted(THUMBNAIL):
                 bounds = (
                     self._raster.grid.bounds if self._coverage is None else self._coverage.bounds_m
                 )
-                image = drawing.draw_thumbnail(self._raster, bounds)
-                write_whole(
-                    self._folder / THUMBNAIL, cv2.imencode(".webp", image, WEBP)[1].tobytes()
-                )
+                self._write_image(THUMBNAIL, drawing.draw_thumbnail(self._raster, bounds), WEBP)
         with self.failures.noted(REPORT):
             shown = stages_jpg(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage
             page = report_html(summary, poses, cloud, self._raster, coverage, shown, maps)
             write_whole(self._folder / REPORT, page)
         return summary
+
+    def _write_image(self, name: str, image: U8, options: Sequence[int]) -> None:
+        path = self._folder / name
+        write_whole(path, cv2.imencode(path.suffix, image, options)[1].tobytes())
 
 
 class Failures:
@@ -344,8 +345,9 @@ def surface(fused: FusedCloud, cell_m: float | None = None) -> Raster | None:
     """
     if not len(fused.cloud):
         return None
-    xy = fused.cloud.xyz_m[:, :2].astype(np.float64)
-    ends = [(c.min(), c.max()) for c in xy.T]  # one axis after the other takes a tenth of the time
+    xy = fused.cloud.xyz_m[:, :2]
+    # One axis after the other takes a tenth of the time.
+    ends = [(float(c.min()), float(c.max())) for c in xy.T]
     (west, east), (south, north) = ends
     cell_m = cell_m or preview_cell_m((west, south, east, north), fused.voxel_m)
     return rasterise(fused.cloud, grid_over(xy, cell_m, margin_cells=1))

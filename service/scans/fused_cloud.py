@@ -16,7 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
+from recon.mapping.cloud_fusion import (
+    cloud_of,
+    fuse_strips,
+    without,
+    without_contradicted,
+)
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
 from recon.parallel import run_parallel, threads
@@ -101,7 +106,10 @@ def fused_cloud(
     with progress.part("fusing the cloud", 0.5):
         say = partial(progress.counting(len(extents)), progress.text)
         strips = [_strip(store, extents, held, box, a, b, say) for a, b in pairwise(edges)]
-        cloud = fuse_strips(strips, edges, size)
+        keys, means = fuse_strips(strips, edges, size)
+        release_memory()  # of the strips, before the whole is looked at
+        cloud = without_contradicted(keys, means)
+        del keys, means
     release_memory()
     if len(cloud):
         with progress.part("removing points that other images see through"):

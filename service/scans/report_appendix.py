@@ -133,7 +133,7 @@ def _colour_bar(colours: int, low: str, high: str) -> str:
 
 def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:
     """Maximum views and minimum sigma of the points in each cell, NaN where there are none."""
-    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), cell_m)
+    grid = grid_over(cloud.xyz_m[:, :2], cell_m)
     views, sigma = (np.full(grid.shape, far, np.float32) for far in (-np.inf, np.inf))
     for first in range(0, len(cloud), CHUNK_POINTS):
         some = slice(first, first + CHUNK_POINTS)
