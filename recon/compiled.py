@@ -16,6 +16,7 @@ from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 class _Compact(JITCodeLibrary):  # type: ignore[misc]
     """One kernel's code."""
 
+    _shared_module: Any  # the unpacked form; None until it is needed
     _packed = b""
 
     @classmethod

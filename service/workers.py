@@ -66,6 +66,7 @@ ROWS: tuple[Row, ...] = (
     Row("dense", "reconstruction, pose graph; a replay waits, drops nothing", 2, 3, DROP, _HANG_S),
     Row("coverage", "coverage.png of the growing scan", 2),
     Row("files", "the files of a scan that has ended", 3),
+    Row("progress", "says again what a long step of a command does", 3),
     # The daemon.
     Row("backlog", "opens the earlier scans that the ground lacks", 4),
     Row("backlog closing", "ends the Zenoh session of earlier scans", 4, is_awaited=True),

@@ -4,6 +4,7 @@ import _thread
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import MISSING, fields
@@ -16,6 +17,10 @@ import typer
 
 from service.errors import InputError
 from service.progress import Progress
+from service.workers import PROCESS
+
+QUIET_S = 2.0
+"""After so long without a line a reader asks whether it still works."""
 
 
 def choices(values: Iterable[str]) -> Callable[[str], list[str]]:
@@ -111,7 +116,7 @@ def showing(name: str) -> Iterator[Progress]:
     """Progress of long work on stderr: a bar in a terminal, else a line for each step and for
     each twentieth of the work. Ctrl-C also cancels the work of other threads."""
     with ExitStack() as open_now:
-        show = open_now.enter_context(_bar(name)) if sys.stderr.isatty() else _lines(name)
+        show = open_now.enter_context(_bar(name) if sys.stderr.isatty() else _lines(name))
         progress = Progress(show)
 
         def cancel(*_: object) -> None:
@@ -125,27 +130,60 @@ def showing(name: str) -> Iterator[Progress]:
         yield progress
 
 
-def _lines(name: str) -> Callable[[Progress], None]:
+@contextmanager
+def _lines(name: str) -> Iterator[Callable[[Progress], None]]:
     said = "", 0
 
-    def say(now: Progress) -> None:
+    def show(now: Progress) -> None:
         nonlocal said
         step = now.text, int(now.share * 20.0)
         if step != said:
             said = step
             share = f", {5 * step[1]} %" if step[1] else ""
-            print(f"{name}: {now.text}{share}", file=sys.stderr)
+            say(f"{name}: {now.text}{share}")
 
-    return say
+    with speaking() as say:
+        yield show
+
+
+@contextmanager
+def speaking(quiet_s: float = QUIET_S) -> Iterator[Callable[[str], None]]:
+    """Prints lines to stderr; after ``quiet_s`` without one the last again, with its seconds."""
+    line, began_s, said_s = "", 0.0, 0.0
+
+    def say(text: str) -> None:
+        nonlocal line, began_s, said_s
+        line, began_s = text, time.monotonic()
+        said_s = began_s
+        print(text, file=sys.stderr, flush=True)
+
+    def repeat() -> None:
+        nonlocal said_s
+        now_s = time.monotonic()
+        if line and now_s - said_s >= quiet_s:
+            said_s = now_s
+            print(f"{line}, for {now_s - began_s:.0f} s", file=sys.stderr, flush=True)
+
+    worker = PROCESS.every("progress", quiet_s / 5.0, repeat)
+    try:
+        yield say
+    finally:
+        worker.join()
 
 
 @contextmanager
 def _bar(name: str) -> Iterator[Callable[[Progress], None]]:
     from rich.console import Console
-    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        SpinnerColumn,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as Bars
 
-    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()
     console = Console(stderr=True)
     with Bars(*columns, TimeRemainingColumn(), console=console, transient=True) as bars:
         bar = bars.add_task(name, total=1.0)

@@ -9,14 +9,15 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from service.commands import AsJson
+from service.commands import AsJson, speaking
 from service.errors import InputError, OutsideError
 from service.scans.report_parts import height_sigma_m, within
 from service.scans.writing import check_writable
@@ -52,17 +53,18 @@ def demo(
     compilers = compile_meanwhile()
     if compilers:
         _say(1, "compiling kernels in the background: once, a minute or two")
-    _say(1, "starting the ground station")
     ground = _start_ground(out, endpoint, portal)
     try:
-        _said(ground, out, "ground station at ")
-        if portal:
-            _say(1, f"open this page to watch the map grow: {_said(ground, out, 'portal: ')}")
+        with _meanwhile(1, "starting the ground station"):
+            _said(ground, out, "ground station at ")
+            page = _said(ground, out, "portal: ") if portal else ""
+        if page:
+            _say(1, f"open this page to watch the map grow: {page}")
         images = sum(1 for _ in (source / "frames").iterdir())
         _say(2, f"flight: tracking and reconstructing {images} images")
         _replay(source, out, endpoint, set_ or [])
-        _say(3, "ground station: writing its files")
-        received = _wait_for_ground(ground, out)
+        with _meanwhile(3, "ground station: writing its files"):
+            received = _wait_for_ground(ground, out)
     finally:
         for process in (ground, *compilers):
             end_process(process, 20.0)
@@ -79,6 +81,14 @@ def demo(
 def _say(step: int, what: str) -> None:
     """One line of progress, where it does not disturb the report."""
     print(f"[{step}/3] {what}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _meanwhile(step: int, what: str) -> Iterator[None]:
+    """The same, and again while the work inside lasts."""
+    with speaking() as say:
+        say(f"[{step}/3] {what}")
+        yield
 
 
 def compile_kernels() -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
 import sys
+import time
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +22,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.commands import on_signals, replay, showing
+from service.commands import on_signals, replay, showing, speaking
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import CancelledError, Progress
 
@@ -159,6 +161,18 @@ def test_without_a_terminal_steps_and_twentieths_are_lines() -> None:
         progress("texture")
     lines = ["fusing", "fusing, 30 %", "fusing, 65 %", "texture, 65 %"]
     assert text.getvalue().splitlines() == [f"mesh: {line}" for line in lines]
+
+
+def test_a_long_step_without_a_terminal_is_said_again() -> None:
+    text = io.StringIO()
+    with redirect_stderr(text), speaking(quiet_s=0.05) as say:
+        say("mesh: fusing")
+        while text.getvalue().count("\n") < 3:
+            time.sleep(0.01)
+        say("mesh: texture")
+    first, second, *_ = lines = text.getvalue().splitlines()
+    assert first == "mesh: fusing" and re.fullmatch(r"mesh: fusing, for \d+ s", second)
+    assert "mesh: texture" in lines
 
 
 def test_ctrl_c_cancels_other_threads_too() -> None:

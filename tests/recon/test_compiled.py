@@ -1,0 +1,43 @@
+"""Kernels from numba's cache: packed until another one is compiled that calls them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+KERNELS = """
+from numba import njit
+
+
+@njit(cache=True)
+def inner(x):
+    return 3 * x + 1
+
+
+@njit
+def outer(x):
+    return inner(x) + inner(x + 1)
+"""
+
+BOTH = """
+import recon.parallel
+from kernels import inner, outer
+assert inner(2) == 7
+library, = (found.library for found in inner.overloads.values())
+print(sum(inner.stats.cache_hits.values()), library._shared_module is None, outer(2))
+"""
+
+
+def test_a_kernel_from_the_cache_is_unpacked_for_one_that_calls_it(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    given = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+
+    def said(code: str) -> list[str]:
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
+        return done.stdout.split()
+
+    said("from kernels import inner; inner(2)")
+    assert said(BOTH) == ["1", "True", "17"]
