@@ -1,7 +1,8 @@
-"""A ground station that is gone for minutes."""
+"""A ground station that is gone for minutes, and one of ten drones with keys."""
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from loopback import free_port
+from trial_ground import Fleet, Ground, HonestDrone
 from trial_rig import BACK_S, WHOLE, Row, Service, stored
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(7200 if WHOLE else 280)]
@@ -53,3 +55,38 @@ def test_ground_gone_for_minutes(tmp_path: Path, record: Row) -> None:
     assert scanned_on
     assert not lost
     assert back_s < 6.0 * BACK_S
+
+
+def test_a_fleet_with_keys_arrives_whole(tmp_path: Path, record: Row) -> None:
+    """All at once over TLS, each with its own rights; one is killed in flight and starts again."""
+    for needed in ("zenoh", "cryptography", "starlette", "uvicorn"):
+        pytest.importorskip(needed)
+    names = [f"drone-{k}" for k in range(10 if WHOLE else 3)]
+    fleet = Fleet(tmp_path / "keys", names, "spare")
+    with contextlib.ExitStack() as stack:
+        ground = stack.enter_context(Ground(tmp_path, fleet.base))
+
+        def fly(name: str, folder: str = "") -> HonestDrone:
+            return stack.enter_context(
+                HonestDrone(tmp_path / folder, name, ground.endpoint, **fleet.drone(name))
+            )
+
+        drones = [fly(name) for name in names]
+        ground.until(
+            lambda: all(stored(ground.store / "drones" / name) for name in names), "all of them"
+        )
+        drones[0].process.kill()
+        drones[0] = fly(names[0], "again")
+        time.sleep(60.0 if WHOLE else 3.0)
+        for drone in drones:
+            assert drone.land(), ground.said[-3000:]
+        lost = [drone.lost(ground) for drone in drones]
+        ground.check()
+        assert ground.stop() == 0, ground.said[-3000:]
+    record(
+        f"fleet: {len(names)} drones with keys at once, one of them killed and started again",
+        len(names),
+        "all scans arrive whole",
+        f"{sum(n for n, _ in lost)} of {sum(n for _, n in lost)} chunks",
+    )
+    assert not any(n for n, _ in lost) and all(n for _, n in lost)
