@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from service.errors import OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
-from service.ground.received import ReceivedScan
+from service.ground.received import Change, Files, ReceivedScan
 from service.ground.storage import DiskShare, drone_folder, scan_folder
 from service.stream.messages import Ask, Head, count, pack, unpack
 from service.stream.naming import ROOT
@@ -190,9 +190,9 @@ class DroneReceiver:
             self._close(scan)
         self._show(now)
         for scan in scans:
-            if scan.unwritten or scan.is_writing:
+            if scan.files is not Files.WRITTEN:
                 self._closed.pop(scan.name, None)  # its files are due when it is opened again
-        return [Write(scan.name, scan.folder) for scan in scans if scan.unwritten]
+        return [Write(scan.name, scan.folder) for scan in scans if scan.is_due]
 
     # What comes
 
@@ -316,7 +316,7 @@ class DroneReceiver:
         if closed is None:
             scan.grew()
         else:
-            scan.is_written, scan.trouble = True, closed["trouble"] or ""
+            scan.trouble = closed["trouble"] or ""
         self._scans[name] = scan
         self._effects.append(Opened(scan))
         log.info("receiving %s/%s into %s", self.drone, name, scan.folder)
@@ -333,7 +333,7 @@ class DroneReceiver:
 
     def _end(self, scan: ReceivedScan, now: float) -> None:
         """Close a scan, or have its files written first."""
-        if scan.unwritten or scan.is_writing:
+        if scan.files is not Files.WRITTEN:
             self._write(scan, now)
         else:
             self._close(scan)
@@ -345,18 +345,20 @@ class DroneReceiver:
 
     def _write(self, scan: ReceivedScan, now: float) -> None:
         """Have a scan's deliverables written where it grew, one scan of a drone at a time."""
-        is_due = scan.unwritten and now >= scan.write_at
+        is_due = scan.is_due and now >= scan.write_at
         if is_due and not any(other.is_writing for other in self.scans):
-            scan.changed, scan.unwritten, scan.is_writing = True, False, True
+            scan.changed = True
+            scan.note(Change.BEGIN)
             self._effects.append(Write(scan.name, scan.folder, scan.intake.complete))
 
     def _on_written(self, event: Written, now: float) -> None:
         scan = self._scans.get(event.scan)
         if scan is None or not scan.is_writing:
             return  # it was closed, or deleted and begun again
-        scan.is_written, scan.is_writing, scan.trouble = True, False, event.trouble
+        scan.trouble = event.trouble
+        scan.note(Change.REFUSE if event.is_due else Change.END)
         if event.is_due:
-            scan.unwritten, scan.write_at = True, now + REWRITE_S
+            scan.write_at = now + REWRITE_S
 
     # What to say
 

@@ -10,6 +10,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -73,6 +74,37 @@ def write_files(
     return trouble, is_refused
 
 
+class Files(Enum):
+    """Those beside the database of an open scan."""
+
+    WRITTEN = "written"
+    DUE = "due"  # the scan grew
+    BEGUN = "being written"
+    BEHIND = "behind"  # being written, and the scan grew meanwhile
+    REFUSED = "refused"  # by the disk
+
+
+class Change(Enum):
+    """What happens to the files of a scan."""
+
+    GREW = "grew"
+    BEGIN = "begin"
+    END = "end"
+    REFUSE = "refuse"
+
+
+TRANSITIONS: dict[Files, dict[Change, Files]] = {
+    Files.WRITTEN: {Change.GREW: Files.DUE},
+    Files.DUE: {Change.BEGIN: Files.BEGUN},
+    Files.BEGUN: {
+        Change.GREW: Files.BEHIND, Change.END: Files.WRITTEN, Change.REFUSE: Files.REFUSED
+    },
+    Files.BEHIND: {Change.END: Files.DUE, Change.REFUSE: Files.REFUSED},
+    Files.REFUSED: {Change.BEGIN: Files.BEGUN},
+}  # fmt: skip
+"""The next state; a change that is not listed changes nothing."""
+
+
 @dataclass(slots=True, eq=False)
 class ReceivedScan:
     """One open scan of one drone; used by the drone's worker alone."""
@@ -82,9 +114,7 @@ class ReceivedScan:
     folder: Path
     intake: ScanIntake
     used_at: float
-    is_written: bool = False
-    is_writing: bool = False
-    unwritten: bool = False  # it grew since its files were written, or since that began
+    files: Files = Files.WRITTEN
     write_at: float = 0.0  # its files, not before
     changed: bool = True  # since the last report
     reported_at: float = -1e9
@@ -94,9 +124,22 @@ class ReceivedScan:
 
     def grew(self) -> None:
         """Something new was stored: its files are due, also for the next process."""
-        if not self.unwritten:
+        if not self.is_due:
             mark_due(self.folder)
-        self.changed = self.unwritten = True
+        self.changed = True
+        self.note(Change.GREW)
+
+    def note(self, change: Change) -> None:
+        self.files = TRANSITIONS[self.files].get(change, self.files)
+
+    @property
+    def is_due(self) -> bool:
+        """Its files lack something, also once those being written are."""
+        return Change.GREW not in TRANSITIONS[self.files]
+
+    @property
+    def is_writing(self) -> bool:
+        return Change.END in TRANSITIONS[self.files]
 
     def progress(self) -> dict[str, Any]:
         """Items held and missing, bytes, lags and folder, for people and for JSON."""
@@ -110,7 +153,7 @@ class ReceivedScan:
             "held": {kind: len(numbers) for kind, numbers in held.items()},
             "missing": {kind: len(n) for kind, n in intake.missing().items()},
             "finished": "summary" in held,
-            "complete": intake.complete and self.is_written and not self.is_writing,
+            "complete": intake.complete and self.files in (Files.WRITTEN, Files.REFUSED),
             "received_bytes": intake.received_bytes,
             "duplicates": intake.duplicates,
             "unsound": intake.unsound,

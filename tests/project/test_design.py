@@ -9,7 +9,7 @@ from typing import get_args
 from paths import ROOT
 
 from service.daemon.scan_state import TRANSITIONS
-from service.ground import drone
+from service.ground import drone, received
 from service.workers import ROWS
 
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -34,6 +34,14 @@ def test_the_table_of_a_scan_s_states_is_the_code_s() -> None:
     for state, row in TRANSITIONS.items():
         events = ", ".join(f"{event.value} > {after.text}" for event, after in row.items())
         table.append(f"| {state.text} | {state.phase.value} | {events} |")
+    assert "\n".join(["", *table, ""]) in TEXT
+
+
+def test_the_table_of_a_received_scan_s_files_is_the_code_s() -> None:
+    table = ["| files | change > next |", "| --- | --- |"]
+    for state, row in received.TRANSITIONS.items():
+        changes = ", ".join(f"{change.value} > {after.value}" for change, after in row.items())
+        table.append(f"| {state.value} | {changes} |")
     assert "\n".join(["", *table, ""]) in TEXT
 
 

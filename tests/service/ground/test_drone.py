@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hostile_records import sound_layers
-from hypothesis import Phase, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -36,6 +36,7 @@ from service.ground.drone import (
     Write,
     Written,
 )
+from service.ground.received import TRANSITIONS, Change, Files
 from service.stream import codec
 from service.stream.messages import Head, Held, pack, split, unpack
 from service.stream.naming import place_of
@@ -258,6 +259,33 @@ def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(tmp_path: Pa
     assert sum(entry["received_bytes"] > 45_000 for entry in ground.entries) == 4
     assert sum(scan.intake.held_bytes for scan in ground.scans) <= 100_000
     ground.close(0.0)
+
+
+def test_files_follow_what_grew_and_have_a_way_to_be_written() -> None:
+    for state in Files:
+        reached = {state}
+        while more := {f for at in reached for f in TRANSITIONS[at].values()} - reached:
+            reached |= more
+        assert Files.WRITTEN in reached
+
+
+@given(st.lists(st.sampled_from(Change)))
+def test_files_are_written_only_after_a_writing_that_began_when_all_had_grown(
+    changes: list[Change],
+) -> None:
+    state, is_writing, lacks, is_covered = Files.WRITTEN, False, False, True
+    for change in changes:
+        if change is Change.GREW:
+            lacks, is_covered = True, False  # by the writing that runs
+        elif change is Change.BEGIN:
+            is_covered = is_covered if is_writing else True
+            is_writing = is_writing or lacks
+        elif is_writing:
+            is_writing = False
+            lacks = change is Change.REFUSE or not is_covered
+        state = TRANSITIONS[state].get(change, state)
+        assert (state is Files.WRITTEN) == (not lacks and not is_writing)
+        assert (Change.END in TRANSITIONS[state]) == is_writing
 
 
 class AnyOrder(RuleBasedStateMachine):
