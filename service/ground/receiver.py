@@ -37,7 +37,7 @@ from service.ground.sites import Sites
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
-from service.workers import Worker, Workers
+from service.workers import Worker, Workers, guarded
 
 log = logging.getLogger(__name__)
 
@@ -195,6 +195,7 @@ class Receiver:
                     one.worker.stop.set()
                 for one in self._all:
                     one.worker.join()
+                    guarded(f"scans of {one.scans.drone}", partial(self._end, one))
                 self._write(END, drone.Write("", Path()))
             worker.join()
         self._running = []
@@ -338,7 +339,7 @@ class Receiver:
         ended = [one for one in self._all if one.worker.is_done]
         known = [one for one in ended if one.scans.entries and not one.worker.has_failed]
         for one in set(ended) - set(known[-MAX_RESTING:]):
-            one.scans.close(now)  # what a fault left open
+            self._end(one)
             self._forget(one)
 
     def _forget(self, one: Drone) -> None:
@@ -360,7 +361,11 @@ class Receiver:
             for effect in scans.handle(*came, now):
                 self._perform(one, effect)
             worker.stop.wait(min(time.thread_time() - began_s, MAX_REST_S))
-        for effect in scans.close(now):
+        self._end(one)
+
+    def _end(self, one: Drone) -> None:
+        """Close the scans of a drone whose worker ends, or has ended by a fault."""
+        for effect in one.scans.close(time.monotonic()):
             self._perform(one, effect)
 
     # Effects

@@ -37,6 +37,7 @@ from service.stream.messages import split
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.session import SessionConfig, open_session
 from service.stream.store import ScanStore
+from service.workers import Workers
 
 zenoh = pytest.importorskip("zenoh")
 
@@ -49,12 +50,13 @@ def serving(
     limits: DroneLimits | None = None,
     deliver: Callable[[Path], None] = lambda _: None,
     opened: Callable[[ReceivedScan], None] = lambda _: None,
+    workers: Workers | None = None,
 ) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     session = SessionConfig(mode="router", listen=(endpoint,))
     config = ReceiverConfig(folder, session, limits or DroneLimits(), "base")
-    ground = Receiver(config, deliver=deliver, opened=opened)
+    ground = Receiver(config, workers, deliver, opened)
     ground.start()
     try:
         yield ground, endpoint
@@ -139,6 +141,30 @@ def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(tmp_p
         assert until(failed)
         assert arrives(tmp_path, endpoint)
         assert not ground.workers.failed
+
+
+def test_the_files_of_a_drone_whose_worker_has_failed_are_written_at_the_end(
+    tmp_path: Path,
+) -> None:
+    written = []
+
+    def fails(_: ReceivedScan) -> None:
+        raise KeyError("made up")
+
+    with (
+        serving(tmp_path, None, written.append, fails, Workers(max_restarts=0)) as (
+            ground,
+            endpoint,
+        ),
+        hostile(endpoint) as session,
+    ):
+
+        def failed() -> bool:
+            introduce(session, "evil", "scan-1")
+            return any(worker.has_failed for worker in ground.workers.table())
+
+        assert until(failed)
+    assert tmp_path / "drones" / "evil" / "scan-1" in written
 
 
 def test_deliverables_that_fail_are_said_and_stop_no_others(tmp_path: Path) -> None:
