@@ -2,7 +2,9 @@
 
 Topics: ``/pose`` PoseInFrame, ``/fix`` LocationFix, ``/tf`` FrameTransform, ``/points``
 PointCloud, ``/image`` CompressedImage, ``/camera`` CameraCalibration, ``/log`` Log. Frame
-``world`` is ENU metres about the scan's origin. Chunks are 64 KiB and unbuffered, so that a
+``world`` is ENU metres about the scan's origin. Where the recording is there, ``/frame``
+CompressedImage and ``/frame/camera`` CameraCalibration are the keyframes' frames at full size,
+without distortion. Chunks are 64 KiB and unbuffered, so that a
 process that is killed has written what it logged.
 """
 
@@ -11,6 +13,8 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon import se3
+from recon.camera_model import Undistorter
 from recon.types import F64, U8, Keyframe
-from service.errors import InputError
+from service.errors import InputError, SkyreliefError
+from service.offline.exports.images import frames_at, recording_for
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import needing
+from service.scans.track import camera_of
 from service.scans.writing import writing
 from service.stream.images import whole_bgr
 from service.stream.records import PoseRecord
@@ -30,6 +37,7 @@ from service.stream.store import ScanStore
 
 CHUNK_BYTES = 65_536
 JPEG_QUALITY = 85
+FRAME_TOPIC, FRAME_CAMERA_TOPIC = "/frame", "/frame/camera"
 POINT = np.dtype([("xyz", "<f4", 3), ("bgra", "u1", 4), ("sigma_m", "<f4"), ("views", "u1")])
 
 
@@ -45,13 +53,43 @@ TOPICS = {
 
 
 def write_mcap(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Keyframes, poses and corrections of the store as MCAP."""
+    """Keyframes, poses and corrections of the store as MCAP, and the recording's frames."""
     with writing(out) as part:
-        export_mcap(scan.store, part)
+        export_mcap(scan.store, part, _frames(scan, options))
 
 
-def export_mcap(store: ScanStore, out_path: Path) -> int:
-    """Write ``store`` to ``out_path``, in order of time; how many messages that makes.
+def _frames(scan: ScanView, options: ExportOptions) -> Iterator[Frame]:
+    """Those of the keyframes, by time; none where no recording is there."""
+    header = scan.store.header
+    video = recording_for(scan, options).path
+    if video is None:
+        return
+    seqs = {k.time_ns: k.seq for k in scan.store.keyframes()}
+    times = sorted(seqs)
+    camera = camera_of(header)
+    undistort = Undistorter(camera)
+    try:
+        for n, image in frames_at(times, header, video, options.video_epoch_ns, scan.progress):
+            yield Frame(times[n], seqs[times[n]], undistort.image(image), camera.K)
+    except SkyreliefError as error:
+        if options.video is not None:
+            raise
+        scan.progress(f"without the recording's frames: {error}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A keyframe's frame as the camera took it, without distortion."""
+
+    time_ns: int  # unix
+    seq: int
+    bgr: U8  # (H, W, 3)
+    K: F64  # (3, 3) px
+
+
+def export_mcap(store: ScanStore, out_path: Path, frames: Iterable[Frame] = ()) -> int:
+    """Write ``store``, and ``frames`` by time, to ``out_path``, in order of time; how many messages
+    that makes.
 
     Raises OutsideError without the ``foxglove-sdk`` package, InputError when the file cannot
     be written.
@@ -64,8 +102,19 @@ def export_mcap(store: ScanStore, out_path: Path) -> int:
             kind: getattr(channels, f"{kind}Channel")(topic, context=context)
             for kind, topic in TOPICS.items()
         }
-        for time_ns, message in _messages(store):
-            opened[type(message).__name__].log(message, log_time=max(time_ns, 0))
+        found = [((time_ns, opened[type(m).__name__], m) for time_ns, m in _messages(store))]
+        shown = iter(frames)
+        first = next(shown, None)
+        if first is not None:
+            image = channels.CompressedImageChannel(FRAME_TOPIC, context=context)
+            camera = channels.CameraCalibrationChannel(FRAME_CAMERA_TOPIC, context=context)
+            found.append(
+                (frame.time_ns, channel, message)
+                for frame in chain([first], shown)
+                for channel, message in zip((image, camera), _of_frame(frame), strict=True)
+            )
+        for time_ns, channel, message in heapq.merge(*found, key=lambda one: one[0]):
+            channel.log(message, log_time=max(time_ns, 0))
             count += 1
     return count
 
@@ -170,18 +219,25 @@ def _of_keyframe(keyframe: Keyframe, bgr: U8) -> Iterator[Any]:
         fields=[messages.PackedElementField(name=n, offset=at, type=t) for n, at, t in fields],
         data=known_points(keyframe).tobytes(),
     )
-    frame_id = f"keyframe-{keyframe.seq}"
+    yield from _of_frame(Frame(keyframe.time_ns, keyframe.seq, bgr, depth.K))
+
+
+def _of_frame(frame: Frame) -> Iterator[Any]:
+    """The image and its camera."""
+    from foxglove import messages
+
+    stamp, frame_id = _stamp(frame.time_ns), f"keyframe-{frame.seq}"
     yield messages.CompressedImage(
-        timestamp=stamp, frame_id=frame_id, data=jpeg(bgr).tobytes(), format="jpeg"
+        timestamp=stamp, frame_id=frame_id, data=jpeg(frame.bgr).tobytes(), format="jpeg"
     )
-    h, w = depth.depth_m.shape
+    h, w = frame.bgr.shape[:2]
     yield messages.CameraCalibration(
         timestamp=stamp,
         frame_id=frame_id,
         width=w,
         height=h,
-        K=depth.K.ravel().tolist(),
-        P=np.column_stack([depth.K, np.zeros(3)]).ravel().tolist(),
+        K=frame.K.ravel().tolist(),
+        P=np.column_stack([frame.K, np.zeros(3)]).ravel().tolist(),
         R=np.eye(3).ravel().tolist(),
     )
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from painted_ground import SIZE, K
+from painted_strips import flown, made
 
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError
+from service.offline.exports.view import ExportOptions, ScanView, export
 from service.stream import codec
 from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.store import ScanStore
@@ -59,6 +63,31 @@ def decoder(schema: Any) -> Any:
         except TypeError:
             waiting.append(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+
+
+def test_the_recording_gives_frames_at_full_size(tmp_path: Path) -> None:
+    with ScanView(made(tmp_path, flown()[:4])) as scan:
+        without = export(scan, "mcap", tmp_path / "without.mcap", ExportOptions())
+        whole = export(scan, "mcap", None, ExportOptions(video=tmp_path / "stills"))
+    with without.open("rb") as file:
+        summary = mcap_reader.make_reader(file).get_summary()
+        assert summary is not None
+        assert "/frame" not in {channel.topic for channel in summary.channels.values()}
+    frames, cameras, times = [], [], []
+    with whole.open("rb") as file:
+        for schema, channel, message in mcap_reader.make_reader(file).iter_messages():
+            times.append(message.log_time)
+            if channel.topic == "/frame":
+                data = decoder(schema).FromString(message.data).data
+                frames.append(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
+            elif channel.topic == "/frame/camera":
+                cameras.append(decoder(schema).FromString(message.data))
+    assert times == sorted(times)
+    stills = [cv2.imread(str(path)) for path in sorted((tmp_path / "stills").iterdir())]
+    for frame, still, camera in zip(frames, stills, cameras, strict=True):
+        assert frame is not None and still is not None and frame.shape == (*SIZE[::-1], 3)
+        assert np.abs(frame.astype(float) - still).mean() < 8.0
+        assert (camera.width, camera.height) == SIZE and list(camera.K) == K.ravel().tolist()
 
 
 def test_indexed_reader_finds_everything_in_order(tmp_path: Path) -> None:
