@@ -6,8 +6,9 @@ later. Most senders give each image a packet (PES) of its own: such a packet nee
 
 from __future__ import annotations
 
+import re
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,6 +19,19 @@ SURE = 5
 
 LARGEST_BYTES = 1 << 23
 """Of a packet, and so of a coded image; without a limit given, FFmpeg's demuxer cuts at 200 KiB."""
+
+
+LONGEST_HEAD = 4096
+"""Bytes of parameter sets and the like in a packet of their own."""
+
+START = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
+"""The start code of a NAL unit, and its first byte."""
+
+IS_PICTURE: dict[str, Callable[[int], bool]] = {
+    "h264": lambda first: 1 <= first & 0x1F <= 5,
+    "hevc": lambda first: first & 0x7F < 64,
+}
+"""Whether a NAL unit has a part of a picture, by codec."""
 
 
 def access_units(
@@ -46,6 +60,7 @@ def access_units(
     held: list[av.Packet[Any]] = []  # until the first packets show what they hold
     fed = cut = given = 0  # bytes from the stream's start: parsed, in whole images, passed on
     are_whole = True
+    packets = _headed(packets, parser.name)
     for number, packet in enumerate(packets):  # the last one is empty, and empties the parser
         start, fed = fed, fed + packet.size
         begun.append((start, packet))
@@ -66,6 +81,26 @@ def access_units(
         if number >= SURE or not packet.size:
             yield from held
             held.clear()
+
+
+def _headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet[Any]]:
+    """The packets, those that hold nothing of a picture joined to the next one.
+
+    Some senders give the parameter sets of a key frame a packet of their own.
+    """
+    import av
+
+    is_picture, head = IS_PICTURE.get(codec), b""
+    for packet in packets:
+        if is_picture is not None and packet.size <= LONGEST_HEAD:
+            data = bytes(packet)
+            is_started = START.search(data[:5])
+            if is_started and not any(is_picture(nal[0]) for nal in START.findall(data)):
+                head += data
+                continue
+        if head:
+            packet, head = _timed(av.Packet(head + bytes(packet)), packet), b""
+        yield packet
 
 
 def _timed(image: av.Packet[Any], packet: av.Packet[Any]) -> av.Packet[Any]:

@@ -7,6 +7,7 @@ import gc
 import io
 import itertools
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -213,6 +214,43 @@ def test_a_sender_that_parts_its_large_images_spoils_no_more_than_the_first() ->
     assert [k for k, image in enumerate(images) if image not in map(bytes, units)] == [7]
 
 
+@pytest.mark.parametrize("first", [0, 3])
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+def test_parameter_sets_in_packets_of_their_own_cost_no_key_frame(codec: str, first: int) -> None:
+    """They were passed on as an image, and what follows them, the key frame, was dropped."""
+    data, kind = io.BytesIO(), {"libx264": "h264", "libx265": "hevc"}[codec]
+    with av.open(data, "w", format=kind) as out:
+        options = {"tune": "zerolatency", "preset": "ultrafast", "g": "5"}
+        options |= (
+            {"x265-params": "keyint=5:repeat-headers=1:log-level=0"} if kind == "hevc" else {}
+        )
+        stream: Any = out.add_stream(codec, rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for i in range(20):
+            gray = np.full((48, 64, 3), 10 * i, np.uint8)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(gray, format="bgr24")))
+        out.mux(stream.encode(None))
+    parser, whole = av.CodecContext.create(kind, "r"), data.getvalue()
+    images = [bytes(unit) for unit in (*parser.parse(whole), *parser.parse(None))]
+    chunks, is_key = list[bytes](), rb"\x00\x00\x01[\x65\x26\x28\x2a]"
+    for image in images[first:]:
+        at = [found.start() for found in re.finditer(is_key, image)]
+        chunks += [image[: at[0]], image[at[0] :]] if at else [image]
+    assert len(chunks) > len(images[first:])
+    came = list[int]()
+
+    def counted() -> Iterator[bytes]:
+        for number, chunk in enumerate(chunks):
+            came.append(number)
+            yield chunk
+
+    with av.open(io.BytesIO(whole), options={"fflags": "noparse"}) as container:
+        units = [(bytes(unit), len(came)) for unit in cut_out(container, counted())]
+    assert b"".join(unit for unit, _ in units) == b"".join(images[first:])
+    assert len(units) == len(images[first:])
+    assert [seen for _, seen in units[-3:]] == [len(chunks) - k for k in (2, 1, 0)]  # none waits
+
+
 @pytest.mark.parametrize("container", ["mpegts", "h264", "matroska"])
 def test_all_images_of_any_format_are_passed_on(container: str) -> None:
     """Of Matroska, whose H.264 has no start codes, all came as one image at the end."""
@@ -249,7 +287,7 @@ def test_no_image_comes_earlier_where_the_first_packets_were_parts() -> None:
             yield chunk
 
     with twenty_images() as (container, images):
-        chunks = (images[0][:600], images[0][600:], *images[1:])
+        chunks = (images[0][:1000], images[0][1000:], *images[1:])
         seen = [len(came) for _ in cut_out(container, counted(chunks))]
     assert seen[5:-1] == [*range(8, 22)]
 
