@@ -301,9 +301,9 @@ def open_rtmp_listen(rest: str, options: Mapping[str, str]) -> CameraSource:
     place = re.fullmatch(r"(?:([^/\s:]+):)?(\d{1,5})(?:/(\S*))?", rest)
     if place is None or not 0 < int(place[2]) < 65536:
         raise InputError(f"rtmp-listen:{rest} is not like rtmp-listen:1935/live")
-    return _live(
-        f"rtmp://{place[1] or '0.0.0.0'}:{place[2]}/{place[3] or ''}", LISTEN_OPTIONS, listens=True
-    )
+    # The wait for a sender has a limit of its own: a sender that comes late in it is heard out.
+    waits = LISTEN_OPTIONS | {"timeout": f"{OPEN_S:.0f}"}
+    return _live(f"rtmp://{place[1] or '0.0.0.0'}:{place[2]}/{place[3] or ''}", waits, listens=True)
 
 
 def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
@@ -334,7 +334,7 @@ def _live(
     url: str, demuxer: dict[str, str], format_: str | None = None, listens: bool = False
 ) -> CameraSource:
     def opened(stall_s: float) -> av.container.InputContainer:
-        timeout = (OPEN_S, stall_s)
+        timeout = (2.0 * OPEN_S if listens else OPEN_S, stall_s)
         made: av.container.InputContainer = open_container(
             url, format=format_, options=demuxer, timeout=timeout
         )

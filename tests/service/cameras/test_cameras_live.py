@@ -713,6 +713,33 @@ def test_an_attempt_that_waited_for_a_sender_is_followed_by_the_next_at_once() -
     assert waits[1:3] == [0.0, 0.0]
 
 
+def test_a_sender_that_comes_late_while_it_is_waited_for_is_heard_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The wait ended in the midst of its handshake, and the sender was cut off."""
+    monkeypatch.setattr(live, "OPEN_S", 2.0)
+    port = free_port()
+    with pytest.raises(NoSenderError):
+        open_camera(f"rtmp-listen:127.0.0.1:{port}/live")
+
+    def wait() -> None:
+        with pytest.raises(OutsideError):
+            open_camera(f"rtmp-listen:127.0.0.1:{port}/live")
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    time.sleep(1.0)
+    with socket.create_connection(("127.0.0.1", port)) as sender:
+        sender.settimeout(30.0)
+        came_s = time.monotonic()
+        sender.sendall(b"\x03")  # the first byte of a handshake
+        with contextlib.suppress(ConnectionError):
+            while sender.recv(4096):
+                pass
+        assert time.monotonic() - came_s > 1.5  # it was 1.0
+    waiting.join(30.0)
+
+
 @pytest.mark.parametrize("source", ["rtmp-listen:live", "rtmp-listen:0/live", "srt://", "srt:9000"])
 def test_a_place_to_listen_at_has_a_port(source: str) -> None:
     with pytest.raises(InputError, match="is not like"):
