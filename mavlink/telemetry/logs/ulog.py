@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mavlink.telemetry.decode import CLEARANCE_SIGMA_M, DOWNWARD, plausible_place, receiver_accuracy
 from mavlink.telemetry.gimbal import frame_of_flags
@@ -51,8 +52,10 @@ Row = Callable[[str], float]
 """The value of a declared field; NaN where the log does not declare it."""
 
 PLACES = ("vehicle_global_position", "vehicle_local_position", "vehicle_gps_position", "sensor_gps")
-"""Topics with a position, best first; the first that has one gives them all."""
+"""Topics with a position, best first; a later one gives them before and after those of a better
+one: an estimate may begin long after the receiver's fixes, or end."""
 
+NEIGHBOUR_US = 10_000_000
 NEAR_US = 250_000
 """Velocities are known so long before and after a sample of theirs."""
 
@@ -65,20 +68,30 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     if offset_us is None:
         warnings.append("no GPS time in this log: its clock starts at boot")
     _complete(topics)
-    is_placed = False
+    placed: list[int] = []  # first and last time in us of a position so far
     for name, read in TABLE.items():
         columns = topics.get(name, {"timestamp": np.empty(0, np.int64)})
         times = columns["timestamp"].astype(np.int64) + (offset_us or 0)
-        sound = np.flatnonzero((times >= 0) & (times < LATEST_USEC))  # others are damaged
+        sound = np.flatnonzero((times >= 0) & (times < LATEST_USEC) & _is_beside(times))
         found = [(int(times[i]), sample) for i in sound for sample in read(_row(columns, i))]
         for time_us, sample in found:
-            if not (is_placed and name in PLACES and isinstance(sample, OF_PLACE)):
+            is_known = bool(placed) and placed[0] <= time_us <= placed[-1]
+            if not (is_known and name in PLACES and isinstance(sample, OF_PLACE)):
                 history.add(sample, time_us * 1000)
-        is_placed |= any(isinstance(sample, PositionSample) for _, sample in found)
+        at = [*placed, *(t for t, sample in found if isinstance(sample, PositionSample))]
+        placed = [min(at), max(at)] if at else []
     return finish(path, history, counts, warnings, "boot" if offset_us is None else "unix")
 
 
 OF_PLACE = (PositionSample, AccuracySample)
+
+
+def _is_beside(times_us: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether a sample is close in time to the one before or after it; others are damaged."""
+    if len(times_us) < 2:
+        return np.ones(len(times_us), bool)
+    is_close = np.abs(np.diff(times_us)) <= NEIGHBOUR_US
+    return np.append(is_close, False) | np.insert(is_close, 0, False)
 
 
 def _row(columns: Columns, i: int) -> Row:
