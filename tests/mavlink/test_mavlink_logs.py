@@ -1006,6 +1006,29 @@ def test_settings_of_the_history_reach_it() -> None:
     assert log.history.config is config
 
 
+def test_receivers_fixes_fill_what_an_estimate_leaves(tmp_path: Path) -> None:
+    """The estimate began late, and the whole log before it had no position; one sample of a wrong
+    time makes no log of an hour."""
+    pytest.importorskip("pyulog")
+    gps = STAMP + "double latitude_deg;double longitude_deg;double altitude_msl_m;float eph;"
+    writer = UlogWriter(ULOG | {"vehicle_gps_position": gps + "float epv;uint8_t fix_type;"})
+    for k in range(100):
+        us = 10_000_000 + k * 100_000
+        writer.add("vehicle_attitude", us, 1.0, 0.0, 0.0, 0.0)
+        writer.add("vehicle_gps_position", us, 47.4, 8.5, 500.0, 1.5, 2.0, 3)
+        if 60 <= k < 80:
+            writer.add("vehicle_global_position", us, 47.3, 8.5, 512.5, 0.0, 0.0, 0.0, 0.6, 0.9)
+    writer.add("vehicle_attitude", 3_600_000_000, 1.0, 0.0, 0.0, 0.0)
+    path = tmp_path / "log.ulg"
+    path.write_bytes(writer.data)
+    log = load_telemetry(path)
+    assert (log.last_ns - log.first_ns) * 1e-9 == pytest.approx(9.9)
+    for time_s, lat, sigma_m in ((2.0, 47.4, 1.5), (7.0, 47.3, 0.6), (9.5, 47.4, 1.5)):
+        state = log.history.state_at(log.first_ns + round(time_s * 1e9))
+        assert state is not None and state.lat_deg == pytest.approx(lat)
+        assert state.sigma_h_m == pytest.approx(sigma_m, abs=0.01)
+
+
 def test_a_damaged_ulg_is_said_in_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
