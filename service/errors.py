@@ -29,6 +29,10 @@ class InputError(SkyreliefError):
     exit_code = 2
 
 
+class MissingError(InputError):
+    """What was asked for is not there."""
+
+
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
     """Make a ValueError of the block, which refuses what was given, an InputError of ``what``."""

@@ -25,7 +25,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError, MissingError, OutsideError
 from service.ground.bodies import BODIES, Body, JSONResponse, changing
 from service.ground.control import control_routes
 from service.ground.guard import (
@@ -220,15 +220,15 @@ def _operation(endpoint: Callable[..., Any], method: str) -> dict[str, Any]:
     return out
 
 
+CODES = {MissingError: 404, ConflictError: 409, OutsideError: 503}
+"""Of other refusals it is 400."""
+
+
 def _said(request: HTTPConnection, error: Exception) -> Response:
-    """An error as JSON: 404 for a missing resource, 409 for a conflict with a newer change, 503 for
-    an outside failure, else 400.
-    """
+    """An error as JSON."""
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-    status = 404 if str(error).startswith("no ") else 400
-    for kind, code in ((OutsideError, 503), (ConflictError, 409)):
-        status = code if isinstance(error, kind) else status
+    status = next((code for kind, code in CODES.items() if isinstance(error, kind)), 400)
     return JSONResponse({"error": str(error)}, status)
 
 
@@ -453,7 +453,7 @@ def _order(request: Request, order: VehicleOrder) -> Response:
     note(request, order.action, metres=order.metres)
     vehicle = state_of(request).vehicle
     if vehicle is None:
-        raise InputError("no vehicle: start with 'skyrelief ground --vehicle ENDPOINT'")
+        raise MissingError("no vehicle: start with 'skyrelief ground --vehicle ENDPOINT'")
     if order.action != "stop" and not request.app.state.order_pace.take():
         raise HTTPException(429, "too many commands; wait a second", {"retry-after": "1"})
     return JSONResponse(vehicle.order(order.action, order.metres))

@@ -19,7 +19,7 @@ from typing import Any
 
 import msgspec
 
-from service.errors import InputError, OutsideError, SkyreliefError
+from service.errors import InputError, MissingError, OutsideError, SkyreliefError
 from service.ground.mcap_import import header_in, store_from_mcap
 from service.ground.scan_facts import Labels, facts_of, read_strictly
 from service.ground.storage import (
@@ -113,12 +113,12 @@ class Library:
     def folder(self, drone: str, scan: str) -> Path:
         """The folder of a scan. Raises InputError when there is none, whatever the names."""
         if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)):
-            raise InputError("no such scan: a name may hold letters, digits, dots and dashes")
+            raise MissingError("no such scan: a name may hold letters, digits, dots and dashes")
         site = self.store / SITES / scan
         is_site = drone == SITES and is_regular(site / "scan.db")
         folder = site if is_site else drone_folder(self.store, drone) / scan
         if not is_regular(folder / "scan.db"):
-            raise InputError(f"no scan {drone}/{scan}")
+            raise MissingError(f"no scan {drone}/{scan}")
         return folder
 
     def entry(self, drone: str, scan: str) -> dict[str, Any]:
@@ -150,7 +150,7 @@ class Library:
         """The path of a deliverable. Raises InputError for any other file."""
         path = self.folder(drone, scan) / name
         if name not in FILES or not is_regular(path):
-            raise InputError(f"no file {name} in {drone}/{scan}"[:200])
+            raise MissingError(f"no file {name} in {drone}/{scan}"[:200])
         return path
 
     def label(
@@ -200,7 +200,7 @@ class Library:
         """Bring a scan back from the bin; its drone and scan."""
         parts = name.split("~")
         if name not in self.bin() or len(parts) != 3:
-            raise InputError("no such scan in the bin")
+            raise MissingError("no such scan in the bin")
         folder = self.store / BIN / name
         target = self._home(parts[0], folder) / parts[1]
         with self._lock:

@@ -18,7 +18,7 @@ from recon.mapping.cloud_fusion import cloud_of
 from recon.mapping.voxel_map import ground_sample_m
 from recon.surface.raster import Grid, Raster, fill_holes
 from recon.types import F32, F64, U8, Array, Keyframe
-from service.errors import InputError
+from service.errors import MissingError
 from service.georeference import LocalFrame
 from service.scans.drawing import exposure, values
 from service.scans.main_piece import main_seqs
@@ -92,7 +92,7 @@ class LiveMap:
         """Raises InputError for a scan without a georeference."""
         frame = local_frame(store.header)
         if frame is None:
-            raise InputError("no map: the scan has no georeference")
+            raise MissingError("no map: the scan has no georeference")
         self._store, self._frame = store, frame
         self.zoom: int | None = None  # the finest that is drawn; finer tiles are enlarged
         self.version = 0  # counts the keyframes that came or changed
@@ -107,7 +107,7 @@ class LiveMap:
         """(west, north, east, south) in the square of Web Mercator; InputError without surface."""
         boxes = np.array(list(self._boxes.values())).reshape(-1, 4)
         if not np.isfinite(boxes).any():
-            raise InputError("no surface yet")
+            raise MissingError("no surface yet")
         west, north = np.nanmin(boxes[:, :2], axis=0).tolist()
         east, south = np.nanmax(boxes[:, 2:], axis=0).tolist()
         return west, north, east, south

@@ -20,7 +20,7 @@ from starlette.routing import Route
 
 from recon.surface.raster import hillshade
 from recon.types import F32, U8
-from service.errors import InputError
+from service.errors import InputError, MissingError
 from service.ground.basemap import Basemap, tile_of, tile_px
 from service.ground.live_map import (
     EQUATOR_M,
@@ -107,7 +107,7 @@ def _place(request: Request) -> Tile:
     """The tile of a request; InputError where the map has none such."""
     z, x, y = (request.path_params[name] for name in "zxy")
     if not (z <= MAX_ZOOM and x < 1 << z and y < 1 << z):
-        raise InputError("no such tile")
+        raise MissingError("no such tile")
     return z, x, y
 
 
@@ -115,7 +115,7 @@ def _asked(request: Request) -> tuple[PortalState, Path, str]:
     """State, folder and layer of a request; InputError where there is none."""
     state, layer = state_of(request), request.path_params["layer"]
     if layer not in (*LAYERS, TERRAIN):
-        raise InputError(f"no layer {layer[:40]}; there are {', '.join((*LAYERS, TERRAIN))}")
+        raise MissingError(f"no layer {layer[:40]}; there are {', '.join((*LAYERS, TERRAIN))}")
     return state, folder_of(request), layer
 
 
@@ -189,7 +189,7 @@ def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:
     }
     with open_map(path, 4 if layer == "ortho" else 1) as image:
         if image.crs is None:
-            raise InputError("no map: the scan has no georeference")
+            raise MissingError("no map: the scan has no georeference")
         with WarpedVRT(image, **options) as warped:
             bands = warped.read()
         unknown = image.nodata
@@ -258,7 +258,7 @@ def contour_mask(height_m: F32, step_m: float) -> np.ndarray:
 
 def coverage_image(found: Coverage, tile: Tile) -> U8:
     if found.frame is None:
-        raise InputError("no map: the scan has no georeference")
+        raise MissingError("no map: the scan has no georeference")
     west, south, east, north = found.bounds_m
     corners = np.array([[west, north, 0.0], [east, north, 0.0], [west, south, 0.0]])
     scale = float(SIDE << tile[0])
@@ -412,7 +412,7 @@ def _basemap_json(request: Request) -> Response:
 def _given(request: Request) -> Basemap:
     found = state_of(request).basemap
     if found is None:
-        raise InputError("no basemap: start with 'skyrelief ground --basemap FILE'")
+        raise MissingError("no basemap: start with 'skyrelief ground --basemap FILE'")
     return found
 
 

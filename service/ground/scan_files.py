@@ -16,7 +16,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from recon.types import Keyframe
-from service.errors import InputError
+from service.errors import InputError, MissingError
 from service.ground.live import FlightPath
 from service.ground.state import folder_of, names_of, state_of
 from service.ground.storage import is_regular
@@ -80,7 +80,7 @@ def _maps(request: Request) -> Response:
     """All maps in one zip, as the deliverable ``all`` has left them."""
     folder = folder_of(request) / MAPS
     if not is_regular(folder / MANIFEST):
-        raise InputError(f"no maps yet; make {MAPS_KIND!r} first")
+        raise MissingError(f"no maps yet; make {MAPS_KIND!r} first")
     name = f"{request.path_params['scan']}-maps.zip"
     headers = {"content-disposition": f'attachment; filename="{name}"'}  # FileResponse's alone
     return StreamingResponse(zip_parts(folder), media_type="application/zip", headers=headers)
@@ -124,7 +124,7 @@ def _tile(request: Request) -> Response:
     fit = TILE.fullmatch(name) and all(re.fullmatch(r"[A-Za-z0-9_]{1,80}", part) for part in inner)
     path = folder.joinpath(*inner, name) if fit and len(inner) < DEEPEST_TILE else folder
     if not is_regular(path):
-        raise InputError("no such tile")
+        raise MissingError("no such tile")
     return FileResponse(path)
 
 
@@ -136,14 +136,14 @@ def _image(request: Request) -> Response:
     if keyframe is not None:
         data = _jpeg(keyframe, data)
     if data is None:
-        raise InputError("no such keyframe")
+        raise MissingError("no such keyframe")
     return Response(data, media_type="image/jpeg")
 
 
 def seq_of(request: Request) -> int:
     """The keyframe in the path. Raises InputError for what is no number of one."""
     if not SEQ.fullmatch(request.path_params["seq"]):
-        raise InputError("no such keyframe")
+        raise MissingError("no such keyframe")
     return int(request.path_params["seq"])
 
 
@@ -162,7 +162,7 @@ def _coverage(request: Request) -> Response:
     """The coverage layer as it is now, also of a scan that still grows."""
     found = state_of(request).coverages.view(folder_of(request)).found
     if found is None:
-        raise InputError("no surface yet")
+        raise MissingError("no surface yet")
     if request.scope["path"].endswith(".png"):
         return Response(found.png_bytes(), media_type="image/png")
     return Response(found.json_bytes(), media_type="application/json")
@@ -174,7 +174,7 @@ def _track(request: Request) -> Response:
         frame, path = local_frame(store.header), FlightPath(store)
         path.grown()
     if frame is None:
-        raise InputError("no track on a map: the scan has no georeference")
+        raise MissingError("no track on a map: the scan has no georeference")
     places = frame.to_geodetic(np.array(path.places(), np.float64).reshape(-1, 3))
     line = np.round(places[:, [1, 0, 2]], 8).tolist()
     geometry = {"type": "LineString", "coordinates": line} if len(line) > 1 else None
@@ -190,14 +190,16 @@ def _refly(request: Request) -> Response:
         raise InputError("there is refly.geojson, refly.plan and refly.waypoints")
     folder = folder_of(request)
     found = state_of(request).coverages.view(folder).found
-    if found is None or found.frame is None:
-        raise InputError("no surface yet" if found is None else "the scan has no georeference")
+    if found is None:
+        raise MissingError("no surface yet")
+    if found.frame is None:
+        raise InputError("the scan has no georeference")
     with ScanStore.peek(folder / "scan.db") as store:
         flight = suggest_as_flown(found, main_track(store))
     if kind == "geojson":
         return Response(geojson(flight, found.frame), media_type="application/geo+json")
     if flight is None:
-        raise InputError(NO_FLIGHT)
+        raise MissingError(NO_FLIGHT)
     text = plan_json(flight) if kind == "plan" else waypoints_text(flight)
     name = f"{request.path_params['scan']}-refly.{kind}"
     return Response(text, headers={"content-disposition": f'attachment; filename="{name}"'})

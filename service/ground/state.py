@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from starlette.requests import HTTPConnection
 
-from service.errors import InputError, SkyreliefError
+from service.errors import InputError, MissingError, SkyreliefError
 from service.ground.basemap import Basemap
 from service.ground.drone import DroneLimits
 from service.ground.library import Library
@@ -160,7 +160,7 @@ class Jobs:
         with self._lock:
             found = [j for j in self._jobs if j.number == number and not j.has_ended]
             if not found:
-                raise InputError(f"no job {number} is waiting or running")
+                raise MissingError(f"no job {number} is waiting or running")
             found[0].progress.cancel()
             if found[0].state == "waiting":
                 found[0].end("cancelled")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from service.errors import InputError
+from service.errors import InputError, MissingError
 from service.scans.writing import write_whole
 from service.small_file import read_json
 
@@ -100,7 +100,7 @@ def delete_annotation(folder: Path, number: int) -> None:
     found = read_annotations(folder)
     rest = [one for one in found.features if one.id != number]
     if len(rest) == len(found.features):
-        raise InputError(f"no annotation {number}")
+        raise MissingError(f"no annotation {number}")
     _write(folder, Annotations(features=rest, last_id=_last_id(found)))
 
 

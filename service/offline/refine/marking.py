@@ -20,7 +20,7 @@ from recon.calibration.tracks import with_distortion, without_distortion
 from recon.camera_model import project, rays, scaled
 from recon.similarity import Similarity
 from recon.types import F64, U8, Camera
-from service.errors import InputError, SkyreliefError
+from service.errors import InputError, MissingError, SkyreliefError
 from service.georeference import LocalFrame
 from service.offline.exports.images import frames_at, recording_of
 from service.offline.refine.control_points import (
@@ -76,7 +76,7 @@ class Marking:
     def __init__(self, store: ScanStore) -> None:
         states = Revisions(store).states(NEWEST)
         if not len(states):
-            raise InputError("no keyframes yet")
+            raise MissingError("no keyframes yet")
         self.camera = camera_of(store.header)
         self._scan = ScanImages(
             states, store.poses(), store.header, lambda k: store.keyframe(states.seqs[k]),
@@ -186,7 +186,7 @@ def image_of(folder: Path, store: ScanStore, seq: int) -> bytes:
     """
     keyframe = store.keyframe(seq)
     if keyframe is None:
-        raise InputError("no such keyframe")
+        raise MissingError("no such keyframe")
     bgr = _recorded(folder, store, keyframe.time_ns)
     if bgr is None:
         whole, K = whole_bgr(keyframe, store.image(seq)), keyframe.depth.K
@@ -239,7 +239,7 @@ def marked(
     Raises InputError for an unknown point, or too many marks of it.
     """
     if name not in {p.name for p in survey}:
-        raise InputError(f"no control point {name[:100]!r}")
+        raise MissingError(f"no control point {name[:100]!r}")
     return [_marked(p, seq, uv_px) if p.name == name else p for p in survey]
 
 
