@@ -87,7 +87,8 @@ def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     """Heights of the cells less the truth's, straight below or above their middles.
 
     Band 3, where there is one, marks filled cells: they have figures of their own. ``inside`` is
-    the share of known cells within the outline of the known ones.
+    the share of known cells within the outline of the known ones, ``half_cell_rms_m`` what the true
+    heights of places half a cell to the east would have: no step is placed better.
     """
     from scipy.ndimage import binary_fill_holes
 
@@ -104,10 +105,13 @@ def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     }
     for name, fit in fits.items():
         moved = fit.points(cells)
-        error = moved[:, 2] - heights_below(truth.surface, moved[:, :2])
+        true = heights_below(truth.surface, moved[:, :2])
+        error = moved[:, 2] - true
+        beside = heights_below(truth.surface, moved[:, :2] + [0.5 * image.cell_m, 0.0]) - true
         on_truth = np.isfinite(error)
         share = _seen_in(seen, image, known, fit, truth)
         out[name] = {"completeness": share} | _height_figures(error[on_truth])
+        out[name]["half_cell_rms_m"] = float(np.sqrt(np.nanmean(beside**2)))
         if is_filled.any():
             out[name]["filled"] = _height_figures(error[on_truth & is_filled])
     return out

@@ -3,17 +3,20 @@
     PYTHONPATH=tests/bench python tests/bench/product_sheets.py OUT SCAN FLIGHT [SCAN FLIGHT ...]
         [--before FOLDER ...]
 
-Writes ``OUT/index.html`` and its images, of the roof edges (where there is truth, its own) also
-one image, ``OUT/edges-SCAN.png``. Products that a scan lacks are made first. ``--before``
-is a folder of products of an older version, one per scan. ``FLIGHT`` is a folder of ``simulate``,
-or a video or folder of stills without truth.
+Writes ``OUT/index.html`` and its images, and for each scan one image for the documents,
+``OUT/SCAN.webp``: orthophoto, heights and contours before, now and in truth, mesh and splats
+before and now, then the roof edges (where there is truth, its own) in two columns: the frame,
+orthophotos and heights as above. Products that a scan lacks are made first. ``--before`` is a
+folder of products of an older version, one per scan. ``FLIGHT`` is a folder of ``simulate``, or a
+video or folder of stills without truth.
 """
 
 from __future__ import annotations
 
 import html
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated
 
@@ -48,6 +51,8 @@ EDGES, EDGE_PX, EDGE_M, EDGE_STEP_M = 20, 150, 3.0, 1.5
 EVERY = 100
 """Of the frames that took no part; each takes seconds."""
 
+WEBP = [cv2.IMWRITE_WEBP_QUALITY, 60]
+
 SIDE_PX = (640, 480)
 SIDES = {"above": (0, 90), "the north": (0, 35), "the east": (90, 35), "the south": (180, 35),
          "the west": (270, 35)}  # fmt: skip
@@ -62,9 +67,11 @@ def from_above(folder: Path, grid: Grid, low_high_m: F64) -> Images:
     if (folder / "ortho.tif").is_file():
         out["ortho"] = np.ascontiguousarray(_read(folder / "ortho.tif", grid, 3)[..., ::-1])
     if (folder / "dsm.tif").is_file():
-        height = _read(folder / "dsm.tif", grid, 1)[..., 0]
-        height[height == NODATA_M] = np.nan
-        out["dsm"] = relief(height, grid.cell_m, low_high_m)
+        own, height = _heights(folder)
+        lit = relief(height, own.cell_m, low_high_m)
+        rows, cols = own.cells(_middles(grid))
+        is_there = own.holds(_middles(grid))[:, None]
+        out["dsm"] = np.where(is_there, lit[rows, cols], np.uint8(128)).reshape(*grid.shape, 3)
     if (folder / "contours.geojson").is_file() and "ortho" in out:
         out["contours"] = out["ortho"].copy()
         for places in _lines(folder):
@@ -116,6 +123,15 @@ def _read(path: Path, grid: Grid, bands: int) -> Array:
     return np.asarray(found.transpose(1, 2, 0))
 
 
+def _heights(folder: Path) -> tuple[Grid, F32]:
+    """Grid and heights of the surface model; NaN where unknown."""
+    with open_map(folder / "dsm.tif") as image:
+        grid = Grid(image.transform.c, image.transform.f, image.transform.a, image.shape)
+        height = image.read(1)
+    height[height == NODATA_M] = np.nan
+    return grid, height
+
+
 def _lines(folder: Path) -> Iterator[F64]:
     """(N, 2) places of each contour on the map of the orthophoto."""
     from pyproj import Transformer
@@ -150,7 +166,7 @@ def window(middle: F64, cell_m: float, size_px: int) -> Grid:
 
 def edges(height_m: F32, grid: Grid) -> list[tuple[F64, float]]:
     """Middles on the map and heights of straight steps of a surface (unknown cells are NaN), the
-    longest first, apart from each other."""
+    longest first, apart from each other and from the unknown."""
     high, low = highest_lowest(height_m, 1)
     step = (high - low > EDGE_STEP_M) & (height_m > 0.5 * (high + low))
     least = EDGE_M / grid.cell_m
@@ -160,7 +176,11 @@ def edges(height_m: F32, grid: Grid) -> list[tuple[F64, float]]:
     for u0, v0, u1, v1 in lines[np.argsort(-np.hypot(*(lines[:, 2:] - lines[:, :2]).T))]:
         row, col = 0.5 * (v0 + v1), 0.5 * (u0 + u1)
         place = grid.centres(np.array([row]), np.array([col]))[0]
-        if all(np.hypot(*(place - other)) > EDGE_M for other, _ in out):
+        top, left = (max(0, round(at - least)) for at in (row, col))
+        near = np.s_[top : round(row + least), left : round(col + least)]
+        if np.isfinite(height_m[near]).all() and all(
+            np.hypot(*(place - other)) > EDGE_M for other, _ in out
+        ):
             out.append((place, float(high[round(row), round(col)])))
     return out[:EDGES]
 
@@ -204,6 +224,26 @@ def from_five_sides(folder: Path, target: F64, pixel_m: float) -> Images:
     return out
 
 
+def framed(images: Iterable[U8]) -> U8:
+    """Images of one height beside each other, each with a black border."""
+    return np.hstack([np.pad(one, ((2, 2), (2, 2), (0, 0))) for one in images])
+
+
+def flowed(images: Sequence[U8], wide_px: int) -> Iterator[U8]:
+    """Rows of images of one height in this order, each as long as it may be."""
+    for _, alike in groupby(images, key=lambda one: one.shape):
+        group = list(alike)
+        many = max(1, wide_px // (group[0].shape[1] + 4))
+        for first in range(0, len(group), many):
+            yield framed(group[first : first + many])
+
+
+def stacked(rows: Sequence[U8]) -> U8:
+    """Images above each other, the narrower ones black on the right."""
+    wide = max(one.shape[1] for one in rows)
+    return np.vstack([np.pad(one, ((0, 0), (0, wide - one.shape[1]), (0, 0))) for one in rows])
+
+
 class Page:
     """Rows of images, each at one pixel to a pixel of the screen."""
 
@@ -221,6 +261,12 @@ class Page:
             self.parts.append(f"<figure><img src={name}><figcaption>{words}</figcaption></figure>")
         self.parts.append("</div>")
 
+    def write(self) -> Path:
+        """The page so far."""
+        path = self.out / "index.html"
+        path.write_text("\n".join(self.parts), encoding="utf-8")
+        return path
+
 
 def make_products(scan: ScanView) -> None:
     """What the scan lacks of KINDS."""
@@ -237,10 +283,7 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
     folder, name = scan.folder, html.escape(scan.folder.name)
     with open_map(folder / "ortho.tif", 3) as image:
         cell_m = float(image.transform.a)
-    with open_map(folder / "dsm.tif") as image:
-        own = Grid(image.transform.c, image.transform.f, image.transform.a, image.shape)
-    height = _read(folder / "dsm.tif", own, 1)[..., 0]
-    height[height == NODATA_M] = np.nan
+    own, height = _heights(folder)
     low_high_m = np.nanpercentile(height, [1.0, 99.0]).astype(np.float64)
     truth = read_truth(flight / "truth") if (flight / "truth").is_dir() else None
     fits = {} if truth is None else fits_of(folder, truth)
@@ -267,30 +310,44 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
     for place, _ in roofs:
         if all(np.abs(place - other).max() > WINDOW_PX * cell_m / 2 for other in chosen):
             chosen.append(place)
+    tiles: list[U8] = []
     for place in chosen[:WINDOWS]:
         for images in rows(window(place, cell_m, WINDOW_PX)).values():
             page.row(images)
+            if place is chosen[0]:
+                tiles += images.values()
     page.parts.append(f"<h2>{name}: roof edges, the frame laid on the roof's level first</h2>")
     views = shared_images(scan, ExportOptions())
-    sheet = []
+    found = []
     for place, height_m in roofs:
         grid = window(place, cell_m, EDGE_PX)
         ours = rows(grid)
         row = frame_on_plane(scan.frame, views, grid, height_m) | ours["ortho"] | ours["dsm"]
-        sheet.append(np.hstack([np.pad(one, ((2, 2), (2, 2), (0, 0))) for one in row.values()]))
+        found.append(framed(row.values()))
         page.row(row)
-    cv2.imwrite(str(page.out / f"edges-{folder.name}.png"), np.vstack(sheet))
+    half = -(-len(found) // 2)
     page.parts.append(f"<h2>{name}: mesh and splats from five sides</h2>")
     utm = np.array([[*chosen[0], low_high_m[0]]])
     target = (utm if scan.frame is None else scan.frame.from_utm(utm))[0]
     sides = {when: from_five_sides(one, target, cell_m) for when, one in folders.items()}
     for side in sides["now"]:
-        page.row({f"{side}, {when}": one[side] for when, one in sides.items() if side in one})
+        images = {f"{side}, {when}": one[side] for when, one in sides.items() if side in one}
+        page.row(images)
+        if side.endswith("the south"):
+            tiles += images.values()
+    pairs = np.hstack([stacked(found[:half]), stacked(found[half:] or found[:1])])
+    whole = stacked([*flowed(tiles, pairs.shape[1]), pairs])
+    cv2.imwrite(str(page.out / f"{folder.name}.webp"), whole, WEBP)
     page.parts.append(f"<h2>{name}: frames that took no part</h2>")
     video = flight / "flight.mp4"
-    for what, found in score_views(scan, video if video.is_file() else flight, every=EVERY).items():
-        figures = ", ".join(f"{key} {value}" for key, value in found.items())
-        page.parts.append(f"<p>{what}: {figures}</p>")
+    try:
+        scores = score_views(scan, video if video.is_file() else flight, every=EVERY)
+    except InputError as error:  # all frames are keyframes
+        page.parts.append(f"<p>{html.escape(str(error))}</p>")
+        return
+    for what, figures in scores.items():
+        words = ", ".join(f"{key} {value}" for key, value in figures.items())
+        page.parts.append(f"<p>{what}: {words}</p>")
 
 
 def main(
@@ -308,8 +365,8 @@ def main(
                 make_products(scan)
             with ScanView(folder, progress=progress) as scan:  # without what they were made from
                 add_flight(page, scan, flight, before[n] if before else None)
-    (out / "index.html").write_text("\n".join(page.parts), encoding="utf-8")
-    print(out / "index.html")
+        page.write()
+    print(page.write())
 
 
 if __name__ == "__main__":
