@@ -118,6 +118,16 @@ def test_poses_are_those_of_the_scan(few: Path) -> None:
         assert error == pytest.approx(np.mean(off), abs=0.02)
 
 
+def test_colmap_reads_it(few: Path) -> None:
+    images, points = read(few)
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(few / "sparse/0")
+    assert model.num_reg_images() == len(images) and model.num_points3D() == len(points)
+    means = [error for _, _, error in points.values()]
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() == pytest.approx(np.mean(means), abs=0.02)
+
+
 def test_without_the_recording_it_is_refused_in_one_line(
     tmp_path: Path, house: HouseFlight
 ) -> None:
