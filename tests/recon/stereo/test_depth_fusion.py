@@ -131,13 +131,17 @@ def test_noise_of_labels_is_how_far_pairs_of_a_view_disagree(times: float) -> No
     assert np.mean(fused.views[20:, 100:] == 4) > 0.9  # right sigmas: none is left out
 
 
-def test_pairs_of_one_false_motion_have_bounded_noise() -> None:
+@pytest.mark.parametrize(("scatter", "is_kept"), [(0.02, True), (0.035, True), (0.12, False)])
+def test_no_sigma_makes_a_surface_of_a_false_motion(scatter: float, is_kept: bool) -> None:
+    """Pairs whose depths scatter by a share of them, where 0.5 % is stated."""
     rng = np.random.default_rng(6)
-    depths = rng.uniform(10, 90, (3, 180, 320)).astype(np.float32)
-    pairs = [PairDepth(depth, np.full(depth.shape, 0.1, np.float32)) for depth in depths]
-    assert label_noise(pairs) == MAX_NOISE
-    noisy = fuse(pairs, K, np.eye(4), DepthFusionConfig(), MAX_NOISE)
-    assert np.isnan(noisy.depth_m).all()
+    depths = 60.0 * (1.0 + scatter * rng.standard_normal((4, 180, 320))).astype(np.float32)
+    pairs = [PairDepth(depth, np.full(depth.shape, 0.3, np.float32)) for depth in depths]
+    noise = label_noise(pairs)
+    assert noise is not None and (is_kept or noise == MAX_NOISE)
+    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig(), min(noise, 7.0))
+    assert bool(np.isfinite(fused.depth_m).any()) == is_kept
+    assert bool(fused.views.any()) == is_kept
 
 
 @pytest.mark.parametrize("quality", [95, 15, 5])
