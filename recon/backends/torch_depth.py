@@ -79,7 +79,9 @@ class DensePath:
 
         def fused() -> tuple[Tensor, Tensor, Tensor]:
             depth, sigma = found
-            return fuse(depth, sigma * label_noise(depth, sigma), self.stages.fusion)
+            noise = label_noise(depth, sigma)
+            fused, error, views = fuse(depth, sigma * noise.clamp(min=1.0), self.stages.fusion)
+            return fused, error * noise.clamp(max=1.0), views
 
         return found, Plan(self.device, fused, [])
 

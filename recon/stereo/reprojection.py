@@ -249,15 +249,17 @@ def fuse(
 ) -> DepthMap:
     """One depth map of all pairs: at each pixel the largest group that agrees, averaged.
 
-    ``noise`` multiplies all sigmas. The mean is over inverse depth (whose error is nearly Gaussian)
-    with weights 1/sigma^2; the sigma is the larger of the propagated one and the spread inside the
-    group. ``views`` counts the group. Where several pairs read and none comes within
-    ``max_sigma_share`` of another nothing is known. Where more pixels are such than have two that
-    do, however large sigma is, what they see is not a rigid surface, or their motion is false, and
-    the whole map is unknown: of readings with an honest sigma below that share most come so near.
+    The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2; the
+    sigma is the larger of the propagated one and the spread inside the group. ``noise`` multiplies
+    all sigmas; less than 1 only those of the result, as clear images err seldom and then far: pairs
+    that a narrower gate leaves out are good ones. ``views`` counts the group. Where several pairs
+    read and none comes within ``max_sigma_share`` of another nothing is known. Where more pixels
+    are such than have two that do, however large sigma is, what they see is not a rigid surface, or
+    their motion is false, and the whole map is unknown: of readings with an honest sigma below that
+    share most come so near.
     """
     depth = np.stack([p.depth_m for p in pairs])
-    sigma = np.float32(noise) * np.stack([p.sigma_m for p in pairs])
+    sigma = np.float32(max(noise, 1.0)) * np.stack([p.sigma_m for p in pairs])
     shape = depth.shape[1:]
     out = DepthMap(
         np.empty(shape, np.float32), np.empty(shape, np.float32), np.zeros(shape, np.uint8), K,
@@ -269,6 +271,7 @@ def fuse(
         config.max_sigma_share, config.min_sigma_share, out.depth_m, out.sigma_m, out.views,
         close,
     )  # fmt: skip
+    out.sigma_m[:] *= np.float32(min(noise, 1.0))
     if np.count_nonzero(close == 1) > np.count_nonzero(close > 1):
         out.depth_m[:] = out.sigma_m[:] = np.nan
         out.views[:] = 0
