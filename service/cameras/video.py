@@ -33,6 +33,9 @@ MAX_PIXELS = 1 << 27
 
 OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 
+PANORAMAS = frozenset((".360", ".insv"))
+"""Recordings of GoPro and Insta360 that show all around."""
+
 RESTART_NS = 1_000_000_000
 """A time that goes back to this long after the start, at most, begins again: joined recordings."""
 
@@ -401,6 +404,11 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
         raise InputError(f"{path} is not a regular file; for a named pipe write pipe:{path}")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes); copy it from the camera again")
+    if path.suffix.lower() in PANORAMAS:
+        raise InputError(
+            f"{path} shows all around, which no camera model here describes; export a flat video of "
+            "one direction with the maker's program"
+        )
     if path.suffix.lower() in UNREAD:
         raise InputError(f"{path}: {how_to_convert(path)}")
     try:

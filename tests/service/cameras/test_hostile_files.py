@@ -53,6 +53,13 @@ def frames(path: Path) -> int:
         source.close()
 
 
+@pytest.mark.parametrize("name", ["GS010001.360", "VID_1.insv"])
+def test_a_recording_of_all_around_is_refused(tmp_path: Path, mp4: bytes, name: str) -> None:
+    (tmp_path / name).write_bytes(mp4)
+    with pytest.raises(InputError, match="export a flat video of one direction"):
+        open_camera(str(tmp_path / name))
+
+
 def test_flipped_recordings_never_end_in_a_traceback(
     tmp_path: Path, mp4: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
