@@ -406,8 +406,8 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
         raise InputError(f"{path} is empty (0 bytes); copy it from the camera again")
     if path.suffix.lower() in PANORAMAS:
         raise InputError(
-            f"{path} shows all around, which no camera model here describes; export a flat video of "
-            "one direction with the maker's program"
+            f"{path} shows all around, which fits no camera model; "
+            "export a flat video of one direction with the maker's program"
         )
     if path.suffix.lower() in UNREAD:
         raise InputError(f"{path}: {how_to_convert(path)}")
