@@ -99,13 +99,14 @@ def splats_of(
     ``progress`` is called once per keyframe and :func:`steps` times in all.
     """
 
-    def measured(keyframe: Keyframe, view: TextureView) -> tuple[Splats, F32]:
+    def measured(keyframe: Keyframe, view: TextureView) -> _Pixels:
         progress("Gaussians from depth images")
-        return of_depth(keyframe.depth, keyframe.fresh, view)
+        return _known_pixels(keyframe.depth, keyframe.fresh, view)
 
     found = run_parallel(*(partial(measured, k, v) for k, v in zip(keyframes, views, strict=True)))
-    splats, sigma = joined([one for one, _ in found]), np.concatenate([s for _, s in found])
-    splats = _merged(splats, sigma, [k.depth for k in keyframes])
+    kept = _merged(found, [k.depth for k in keyframes])
+    made = (partial(_gaussians, *one) for one in zip(found, kept, views, strict=True))
+    splats = joined(run_parallel(*made))
     splats = joined([splats, *_fillings(splats, views, surface, progress)])
     return _fitted(splats, views, progress)
 
@@ -114,27 +115,49 @@ def steps(keyframes: int) -> int:
     return keyframes * (2 + FITS)
 
 
-def of_depth(depth: DepthMap, mask: Bool, view: TextureView) -> tuple[Splats, F32]:
-    """A Gaussian for each pixel of ``view`` whose depth is known where ``mask`` (h, w) says so, and
-    (N,) the sigma of its depth, m.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pixels:
+    """The pixels of a view whose depth is known."""
+
+    places_m: F32  # (N, 3) in the world
+    xyz_m: F32  # (N, 3) in the camera's axes
+    normal: F32  # (N, 3) in the camera's axes
+    sigma_m: F32  # (N,) of the depth
+    opacity: F32  # (N,)
+    rgb: F32  # (N, 3)
+    footprint_m: F32  # (N,)
+
+
+def _known_pixels(depth: DepthMap, mask: Bool, view: TextureView) -> _Pixels:
+    """Those of ``view`` where the depth is known and ``mask`` (h, w) says so.
 
     The view is taken from the depth map's own place; its grid may be finer.
     """
-    normals = _normals(depth)
-    rows = _pixels(
+    xyz, normal, sigma, opacity, rgb = _pixels(
         np.ascontiguousarray(depth.depth_m, np.float32), np.ascontiguousarray(depth.sigma_m),
-        np.ascontiguousarray(depth.views), mask, normals, depth.K, view.bgra, view.K,
+        np.ascontiguousarray(depth.views), mask, _normals(depth), depth.K, view.bgra, view.K,
     )  # fmt: skip
-    xyz, normal, sigma, opacity, rgb = rows
     footprint = xyz[:, 2] / np.float32(np.sqrt(view.K[0, 0] * view.K[1, 1]))
-    axes, cosine = _axes(xyz, normal)
-    T = view.T_world_camera
-    sizes = np.column_stack(
-        [WIDTH * footprint / cosine, WIDTH * footprint, np.minimum(sigma, WIDTH * footprint)]
-    )
-    places = se3.transform(T, xyz.astype(np.float64)).astype(np.float32)
-    turned = se3.each_quaternion(T[:3, :3] @ axes).astype(np.float32)
-    return Splats(places, turned, sizes.astype(np.float32), opacity, rgb), sigma
+    places = se3.transform(view.T_world_camera, xyz.astype(np.float64)).astype(np.float32)
+    return _Pixels(places, xyz, normal, sigma, opacity, rgb, footprint)
+
+
+def _gaussians(pixels: _Pixels, rows: I64 | slice, view: TextureView) -> Splats:
+    """A Gaussian for some of the pixels of ``view``."""
+    xyz, footprint = pixels.xyz_m[rows], pixels.footprint_m[rows]
+    axes, cosine = _axes(xyz, pixels.normal[rows])
+    thick = np.minimum(pixels.sigma_m[rows], WIDTH * footprint)
+    sizes = np.column_stack([WIDTH * footprint / cosine, WIDTH * footprint, thick])
+    turned = se3.each_quaternion(view.T_world_camera[:3, :3] @ axes).astype(np.float32)
+    return Splats(
+        pixels.places_m[rows], turned, sizes.astype(np.float32), pixels.opacity[rows],
+        pixels.rgb[rows],
+    )  # fmt: skip
+
+
+def of_depth(depth: DepthMap, mask: Bool, view: TextureView) -> Splats:
+    """A Gaussian for each pixel of ``view`` whose depth is known where ``mask`` (h, w) says so."""
+    return _gaussians(_known_pixels(depth, mask, view), slice(None), view)
 
 
 def _normals(depth: DepthMap) -> F32:
@@ -222,20 +245,27 @@ def _axes(xyz: F32, normal: F32) -> tuple[F64, F64]:
     return axes, np.maximum(np.abs(along), MIN_COSINE)
 
 
-def _merged(splats: Splats, sigma_m: F32, depths: Sequence[DepthMap]) -> Splats:
-    """Without what other views see through, and one Gaussian where several images show a place."""
-    count = len(splats)
-    seen = np.where(splats.opacity > SINGLE + 1e-3, 2, 1).astype(np.uint8)
-    cloud = PointCloud(splats.xyz_m, splats.rgb.astype(np.uint8), sigma_m, seen)
-    kept = np.flatnonzero(~seen_through(cloud, spread(depths))) if count else np.zeros(0, np.int64)
-    if not len(kept):
-        return splats.at(kept)
-    cell_m = MERGED / WIDTH * float(np.median(splats.sigma_m[kept, 1]))
-    cell = _cells(splats.xyz_m[kept], cell_m)
-    order = np.lexsort((sigma_m[kept], cell))
-    is_first = np.diff(cell[order], prepend=-1) != 0
-    kept = np.sort(kept[order[is_first]])
-    return splats.at(kept[~_is_lone(splats.xyz_m[kept], cell_m * (1 << ISLAND_SHIFT))])
+def _merged(found: Sequence[_Pixels], depths: Sequence[DepthMap]) -> list[I64]:
+    """The pixels of each view that stay: without what other views see through, and one where
+    several images show a place."""
+    first = np.cumsum([0, *(len(one.sigma_m) for one in found)])
+    places_m, sigma_m, footprint_m = (
+        np.concatenate([getattr(one, name) for one in found])
+        for name in ("places_m", "sigma_m", "footprint_m")
+    )
+    opacity = np.concatenate([one.opacity for one in found])
+    seen = np.where(opacity > SINGLE + 1e-3, 2, 1).astype(np.uint8)
+    cloud = PointCloud(places_m, np.zeros((len(seen), 3), np.uint8), sigma_m, seen)
+    kept = np.flatnonzero(~seen_through(cloud, spread(depths))) if len(seen) else first[:0]
+    if len(kept):
+        cell_m = MERGED * float(np.median(footprint_m[kept]))
+        cell = _cells(places_m[kept], cell_m)
+        order = np.lexsort((sigma_m[kept], cell))
+        is_first = np.diff(cell[order], prepend=-1) != 0
+        kept = np.sort(kept[order[is_first]])
+        kept = kept[~_is_lone(places_m[kept], cell_m * (1 << ISLAND_SHIFT))]
+    at = np.searchsorted(kept, first)
+    return [kept[a:b] - n for a, b, n in zip(at[:-1], at[1:], first[:-1], strict=True)]
 
 
 def _cells(xyz_m: F32, cell_m: float) -> I64:
@@ -281,7 +311,7 @@ def _fillings(
         depth_m[v, u] = np.where(np.isfinite(found_m), found_m, np.nan)
         sigma_m = (depth_m / np.float32(view.K[0, 0])).astype(np.float32)
         depth = DepthMap(depth_m, sigma_m, np.zeros(hole.shape, np.uint8), view.K, T)
-        out.append(of_depth(depth, hole, view)[0])
+        out.append(of_depth(depth, hole, view))
     return out
 
 

@@ -149,7 +149,7 @@ def test_axes_lie_in_the_surface_and_sizes_are_those_of_a_pixel() -> None:
     up = np.array([0.0, np.sin(0.6), np.cos(0.6)])
     T = se3.compose(DOWN, np.array([0.0, 0.0, 20.0]))
     depth = slope(T, up)
-    splats, _ = of_depth(depth, np.ones(SIZE[::-1], np.bool_), painted(depth))
+    splats = of_depth(depth, np.ones(SIZE[::-1], np.bool_), painted(depth))
     assert len(splats) == SIZE[0] * SIZE[1]
     inner = np.abs(splats.xyz_m[:, :2]).max(axis=1) < 4.0
     R = Rotation.from_quat(splats.q_wxyz[inner][:, [1, 2, 3, 0]]).as_matrix()
