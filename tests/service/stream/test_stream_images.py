@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ import pytest
 from recon.types import U8
 from service.ground.intake import SMALL, ScanIntake
 from service.stream.codec import encode
-from service.stream.images import MAX_IMAGE_BYTES, STEPS, encode_image, is_image
+from service.stream.images import MAX_IMAGE_BYTES, STEPS, encode_image, is_image, whole_bgr
 from service.stream.messages import Head, Held, parse, split
 from service.stream.outbox import Outbox, Outgoing
 from service.stream.ranges import RangeSet
@@ -47,12 +48,27 @@ def test_the_best_image_within_the_budget() -> None:
     assert cv2.PSNR(shown, whole) > 30.0
 
 
+def test_no_blocks_are_seen_and_more_of_the_truth(house: HouseFlight) -> None:
+    true, size = ground(640, 360), (160, 90)
+    one = house.keyframe(0, 0.0)
+    old = replace(one, fresh=np.zeros_like(one.fresh), bgr=np.zeros_like(one.bgr))
+    for room in (0.0, 1e9):
+        data = encode_image(true, room)
+        plain = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert plain is not None
+        plain = cv2.resize(plain, size, interpolation=cv2.INTER_CUBIC)
+        small = cv2.resize(true, size, interpolation=cv2.INTER_AREA)
+        assert cv2.PSNR(whole_bgr(old, data), small) > cv2.PSNR(plain, small) + 0.3
+
+
 @pytest.mark.parametrize(("w", "h"), [(1, 1), (1, 2000), (40, 30), (720, 1280)])
-def test_images_of_any_shape(w: int, h: int) -> None:
+def test_images_of_any_shape(house: HouseFlight, w: int, h: int) -> None:
     data = encode_image(np.zeros((h, w, 3), np.uint8), 1e9)
     assert is_image(data)
     shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None and max(shown.shape) <= STEPS[0][0]
+    one = house.keyframe(0, 0.0)
+    assert whole_bgr(one, data).shape == one.bgr.shape
 
 
 def test_what_is_no_image_of_a_keyframe() -> None:
