@@ -411,6 +411,31 @@ def test_a_keyframe_whose_first_depth_is_void_is_gone(
         portal.close()
 
 
+class HighFlight(HouseFlight):
+    """From three times the height, which no sensor states."""
+
+    height_m = 120.0
+
+
+def test_a_view_that_follows_looks_at_the_ground_below_the_aircraft(
+    browser: Browser, tmp_path: Path
+) -> None:
+    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
+    with HighFlight().flown(tmp_path / "drone-1/test-1") as store:
+        portal.start()
+        browser.open("about:blank")
+        browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
+        browser.wait("document.body.dataset.points > 71000")
+        store.add_pose(HighFlight().record(5, 25.0))
+        browser.wait("document.querySelector('.figures').textContent.includes('25 m')")
+        settle(browser)
+        east, north, up = view(browser)[3:]
+        assert east == pytest.approx(25.0, abs=0.5) and abs(north) < 0.5
+        assert abs(up) < 8.0  # the house is 6 m high
+        browser.open("about:blank")
+    portal.close()
+
+
 def test_a_first_depth_hides_no_surface_and_closes_what_has_none(
     browser: Browser, tmp_path: Path, house: HouseFlight
 ) -> None:

@@ -241,6 +241,11 @@ export class Cloud implements Gradual {
     return this.kind === "points" || this.showsFigures ? 1 : PHOTOGRAPHED;
   }
 
+  /** How far the cameras look, m: the median of their depths; 0 without any. */
+  get reach(): number {
+    return this.shared.behind.value / BEHIND;
+  }
+
   /** Metres by which what is not measured is drawn behind. */
   get behind(): number {
     return this.shared.behind.value;

@@ -109,7 +109,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
 
   let last: LastPose | undefined;
   let framed = takeView(stage, place);
-  const reach = (): number => Math.max(last?.agl_m ?? 40, 5);
+  const reach = (): number => Math.max(cloud.reach || (last?.agl_m ?? 40), 5);
   const news = (item: News): void => {
     if (item.type === "link") return link.news(item);
     stage.touch();
