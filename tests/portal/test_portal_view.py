@@ -215,8 +215,16 @@ def test_the_surface_is_closed_also_while_it_moves(browser: Browser, portal: Por
     red = closed[closed[..., 2] > 2.0 * closed[..., 1]]  # the roof, in the colour of its images
     assert len(red) > 100 and np.abs(np.median(red, axis=0) - (47, 47, 230)).max() < 25
     browser.click("Measured only")
-    assert difference(closed, drawn(browser)) > 0.001  # below the roof's edges and around the site
+    only = drawn(browser)
+    assert difference(closed, only) > 0.001  # below the roof's edges and around the site
     browser.click("Measured only")
+    colour_by(browser, "height")
+    heights = drawn(browser)
+    assert solid_share(heights, closed) > 0.99
+    blue, green, _ = np.moveaxis(heights[cv2.absdiff(closed, only).max(axis=2) > 20], -1, 0)
+    assert (green > blue).mean() < 0.5  # no grass where nothing was seen, but the colour of the low
+    colour_by(browser, "colour")
+    assert difference(closed, drawn(browser)) == 0.0
     browser.page.mouse.move(600, 400)
     browser.page.mouse.down()
     for k in range(1, 9):

@@ -12,29 +12,35 @@ const STEP_M = 0.5; // a neighbour that stands higher is another surface
 const SMOOTHINGS = 60;
 const SPIKE = 4; // cells around one that is compared with them
 const SPIKE_M = 2;
+const FIGURES = 0.4; // of the brightness, where colours show figures: of heights alone it has any
 const BELOW = 1; // cells by which it lies below what is measured
 
 const VERTEX = /* glsl */ `
   attribute vec4 tint;
   varying vec4 shown;
+  varying vec3 where;
   ${DRAWN_BEHIND}
   #include <clipping_planes_pars_vertex>
   void main() {
     vec4 mvPosition = modelViewMatrix * vec4(position, 1.0);
+    where = (modelMatrix * vec4(position, 1.0)).xyz;
     gl_Position = drawn(mvPosition, 1.0);
     vec3 linear = mix(tint.rgb / 12.92, pow((tint.rgb + 0.055) / 1.055, vec3(2.4)), step(0.04045, tint.rgb));
     shown = vec4(linear, tint.a);
     #include <clipping_planes_vertex>
   }
 `;
-const FRAGMENT = /* glsl */ `
+const fragment = (shade: string): string => /* glsl */ `
   varying vec4 shown;
+  varying vec3 where;
   #include <clipping_planes_pars_fragment>
+  ${shade}
   void main() {
     #include <clipping_planes_fragment>
     float noise = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715))));
     if (shown.a <= noise) discard;  // fades without the sky behind taking part in exposure
-    gl_FragColor = vec4(shown.rgb, 0.0); // not measured
+    vec3 rgb = mode < 1.5 ? shade(where, shown.rgb, 0.0, 0.0) : vec3(dot(shown.rgb, vec3(0.21, 0.72, 0.07)));
+    gl_FragColor = vec4((mode < 0.5 ? 1.0 : float(${FIGURES})) * rgb, 0.0); // not measured
     #include <colorspace_fragment>
   }
 `;
@@ -196,10 +202,10 @@ function smooth(z: Float32Array, rgb: Float32Array, known: Uint8Array, alpha: Fl
 export class Ground {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
 
-  constructor(behind: THREE.IUniform<number>) {
+  constructor(uniforms: Record<string, THREE.IUniform>, shade: string) {
     const material = new THREE.ShaderMaterial({
-      uniforms: { behind },
-      vertexShader: VERTEX, fragmentShader: FRAGMENT, clipping: true, side: THREE.DoubleSide,
+      uniforms,
+      vertexShader: VERTEX, fragmentShader: fragment(shade), clipping: true, side: THREE.DoubleSide,
     });
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), material);
     this.mesh.raycast = () => undefined; // it is not measured

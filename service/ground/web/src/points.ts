@@ -152,7 +152,7 @@ export class Cloud implements Gradual {
   };
 
   /** What lies below the surfaces; not measured. */
-  readonly ground = new Ground(this.shared.behind);
+  readonly ground = new Ground(this.shared, SHADE);
 
   get total(): number {
     let sum = 0;
