@@ -39,7 +39,7 @@ const fragment = (shade: string): string => /* glsl */ `
     #include <clipping_planes_fragment>
     float noise = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715))));
     if (shown.a <= noise) discard;  // fades without the sky behind taking part in exposure
-    vec3 rgb = mode < 1.5 ? shade(where, shown.rgb, 0.0, 0.0) : vec3(dot(shown.rgb, vec3(0.21, 0.72, 0.07)));
+    vec3 rgb = mode < 1.5 ? shade(where, shown.rgb, 0.0, 0.0) : vec3(0.08 + dot(shown.rgb, vec3(0.21, 0.72, 0.07)));
     gl_FragColor = vec4((mode < 0.5 ? 1.0 : float(${FIGURES})) * rgb, 0.0); // not measured
     #include <colorspace_fragment>
   }
