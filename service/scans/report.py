@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime as dt
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 from itertools import pairwise
 from typing import Any
@@ -60,19 +61,20 @@ def report_html(
     orthophoto and surface model; ``keyframe_jpg`` shows the stages of one keyframe.
     """
     cover, colour, heights = _map_pages(summary, maps)
+    flown = _above_ground(poses, raster)
     sections = [
         ("first", [
             f"<h1>{escape(summary['id'])}</h1>",
             f"<p>Survey report, {_when(summary['times']['started_unix_s'])}</p>",
             *cover,
-            table(_cover(summary, coverage, poses)),
+            table(_cover(summary, coverage, flown)),
         ]),
         ("", [
             "<h2>Accuracy</h2>",
             *(f"<p>{escape(text)}</p>" for text in accuracy_words(summary)),
             *surveyed(summary.get("refinement") or {}),
             "<h2>Flight and camera</h2>",
-            table(_flown(summary, poses)),
+            table(_flown(summary, flown)),
             "<h2>Coverage</h2>",
             map_figure(summary, poses, coverage),
             table(_covered(coverage)),
@@ -275,6 +277,18 @@ def _lens(summary: dict[str, Any]) -> tuple[F64, tuple[int, int]] | None:
     except (KeyError, TypeError, ValueError):
         return None
     return (K, size) if np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 else None
+
+
+def _above_ground(poses: Sequence[PoseRecord], raster: Raster | None) -> Sequence[PoseRecord]:
+    """The poses, with their height above the middle of the surface where none was measured."""
+    if raster is None or not raster.known.any():
+        return poses
+    level_m = float(np.nanmedian(raster.height_m))
+    up_m = [float(p.T_world_camera[2, 3]) - level_m for p in poses]
+    return [
+        replace(p, agl_m=up) if p.agl_m is None and up > 0.0 else p
+        for p, up in zip(poses, up_m, strict=True)
+    ]
 
 
 def _pixel_m(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> float | None:

@@ -20,6 +20,8 @@ WIDTH_PX, LARGEST_HEIGHT_PX = 860, 900
 MAX_ELLIPSES = 40
 SIGMAS = 2.0
 SMALLEST_ELLIPSE_PX = 5.0
+TEXT_PX = 22
+"""Of scale and north: a page shows the map at half its size."""
 TRACK, LOOP, WAITING = "#20252b", "#1a5fd0", "#d08a1a"
 
 
@@ -162,11 +164,12 @@ def _survey(summary: dict[str, Any], view: _View) -> list[str]:
 def _scale_bar(view: _View) -> str:
     """A bar of round length, and north."""
     length_m = round_length(0.2 * view.size_px[0] / view.px_per_m)
-    length, y, x = length_m * view.px_per_m, view.size_px[1] - 12, view.size_px[0] - 16
+    length, y, x = length_m * view.px_per_m, view.size_px[1] - 12, view.size_px[0] - 24
+    text = f'<text style="font-size:{TEXT_PX}px"'
     return (
-        f'<path d="M12 {y - 5}v5h{length:.1f}v-5M{x} 34v-24m-4 8l4 -8l4 8" fill="none" '
-        f'stroke="{TRACK}" stroke-width="1.5"/><text x="16" y="{y - 6}" font-size="11">'
-        f'{length_m:g} m</text><text x="{x - 4}" y="46" font-size="11">N</text>'
+        f'<path d="M12 {y - 8}v8h{length:.1f}v-8M{x} 58v-46m-8 14l8 -14l8 14" fill="none" '
+        f'stroke="{TRACK}" stroke-width="3"/>{text} x="18" y="{y - 10}">{length_m:g} m</text>'
+        f'{text} x="{x - 8}" y="82">N</text>'
     )
 
 

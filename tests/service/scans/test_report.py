@@ -144,7 +144,7 @@ def test_overlap_is_that_of_footprints(house: HouseFlight) -> None:
 def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
         store.finish(SUMMARY["run"])
-        summary = write_deliverables(tmp_path, store, {})
+        summary, poses = write_deliverables(tmp_path, store, {}), store.poses()
     assert key_figures(summary)[2] == "georeferenced"  # the preview states it without reasons too
     page = (tmp_path / "report.html").read_text()
     assert "Consistency" in page and "GNSS position" in page
@@ -152,6 +152,10 @@ def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -
         assert f"<h2>{title}" in page
     assert "m2" not in re.sub(r"base64,[^\"]*", "", page)
     assert "Surveyed points" not in page and "<script" not in page
+    # without a measured height above ground that above the surface counts
+    assert all(p.agl_m is None for p in poses)
+    rows = dict(re.findall(r"<tr><td>([^<]+)</td><td>([^<]+)", page))
+    assert float(rows["height above ground, median"].removesuffix(" m")) == pytest.approx(40, abs=1)
 
 
 def test_figures_of_a_graph_are_its_own() -> None:
