@@ -341,22 +341,20 @@ def telemetry_inside(path: Path, config: HistoryConfig) -> tuple[TelemetryLog, s
     cues = subtitles(path)
     if (cue := next(cues, None)) is not None:
         return srt.of_cues(path, chain((cue,), cues), config), "the video's own subtitles"
-    for is_wanted in (_has_samples, _is_marked):
-        packets = metadata(path, is_wanted)
-        if (packet := next(packets, None)) is not None:
-            break
-    else:
+    is_marked = False
+
+    def is_wanted(packet: bytes) -> bool:
+        """Of a video's several streams of KLV, some hold times or targets alone."""
+        nonlocal is_marked
+        is_marked = is_marked or packet.startswith(klv.MARK)
+        return packet.startswith(gpmf.MARK) or bool(klv.samples_of(klv.fields_of(packet)))
+
+    packets = metadata(path, is_wanted)
+    if (packet := next(packets, None)) is None:
+        if is_marked:
+            raise ValueError(f"{path}: no attitude and no position of a vehicle in its metadata")
         return None
     every = chain((packet,), packets)
     if packet[2].startswith(gpmf.MARK):
         return gpmf.of_packets(path, every, config), "the camera's own track (GPMF)"
     return klv.of_packets(path, every, config), "the video's own metadata (MISB KLV)"
-
-
-def _has_samples(packet: bytes) -> bool:
-    """Of a video's several streams of KLV, some hold times or targets alone."""
-    return packet.startswith(gpmf.MARK) or bool(klv.samples_of(klv.fields_of(packet)))
-
-
-def _is_marked(packet: bytes) -> bool:
-    return packet.startswith((gpmf.MARK, klv.MARK))
