@@ -16,7 +16,7 @@ import numpy as np
 
 from recon.types import U8
 from service.cameras import UNREAD, how_to_convert, reject_options
-from service.cameras.exif import Tags, read_tags
+from service.cameras.exif import DEFAULT_SIGMA_H_M, Tags, read_tags
 from service.cameras.geo_file import geo_file_of, read_geo
 from service.cameras.lens import turned
 from service.cameras.source import CameraFrame, CameraSource, GeoTag
@@ -198,6 +198,11 @@ class ImagesSource(CameraSource):
         if missing == len(tagged):
             raise InputError(f"{geo} names none of the images in {self.description}")
         self._warn(f"positions are those of {geo.name}: {len(tagged) - missing} of {len(tagged)}")
+        if not any(tag.is_sigma_h_stated for tag in places.values()):
+            self._warn(
+                f"{geo.name} states no accuracies: its positions count as uncertain by "
+                f"{DEFAULT_SIGMA_H_M:g} m; surveyed ones need theirs, across and up, in each row"
+            )
         return out
 
     def _one_datum(self, tagged: list[Still]) -> list[Still]:

@@ -129,6 +129,8 @@ def test_stills_are_where_the_file_says(tmp_path: Path) -> None:
         assert tags[0] is not None and (tags[0].lat_deg, tags[0].alt_amsl_m) == (47.3, 412.5)
         assert tags[1] is not None and tags[1].sigma_h_m == 5.0 and tags[2] is None
         assert opened.warnings[0] == "positions are those of geo.txt: 2 of 3"
+    write(images / "geo.txt", "EPSG:4326", "a.jpg 8.5 47.3 412.5")
+    assert "states no accuracies" in open_camera(str(images)).warnings[1]
     write(images / "geo.txt", "EPSG:4326", "other.jpg 8.5 47.3")
     with pytest.raises(InputError, match="names none of the images"):
         open_camera(str(images))
