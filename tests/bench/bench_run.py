@@ -32,11 +32,12 @@ DEVELOPMENT = {
     "real": "bench_real:run",
     "screen": "bench_screen:run",
     "site": "bench_site:run",
+    "slow": "bench_slow_board:run",
     "truth": "bench_truth:run",
 }
 """Name to ``module:function`` of this folder."""
 
-ASKED_FOR = ("board", "device", "growth", "middlebury", "real", "screen", "site")
+ASKED_FOR = ("board", "device", "growth", "middlebury", "real", "screen", "site", "slow")
 """Those that need a GPU, data or many minutes, and run by name only."""
 
 

@@ -1,0 +1,173 @@
+"""``make bench ARGS=slow``: the load ladder on a board of four slow cores, emulated here.
+
+``skyrelief run`` scans a recording of 1280x720 at 30 images a second, decoding included, at its
+own pace, while all its threads stand still for a share of every 20 ms. On two cores, half of the
+time is in all what four cores of a quarter of this machine's speed do, with faster single threads;
+a quarter of the time is the speed of those cores, two of them. The board lies between. Nothing is
+said of its caches and its memory. The peer of each figure is what the ladder allows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recon.types import Camera
+from service.bench import BenchOptions, BenchResult
+from service.bench.pipeline import FPS, HEIGHT_M, SIZE, K, make_video
+from service.cameras.camera_file import save_camera
+from service.daemon.load_shedding import LATE_FRAMES, LATE_VIEWS, OLDEST_S
+from service.errors import OutsideError
+from service.listener import free_ports
+from service.workers import end_process, python_command
+
+SHARES = {"half of the time": 0.5, "a quarter of the time": 0.25}
+PERIOD_S, LOOK_S = 0.02, 0.5
+START_S = 240.0
+"""For a slow start; kernels are compiled before."""
+SETTLED_S = 20.0
+"""At the end of the flight the ladder has taken its steps."""
+
+
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Of each share: the steps of the ladder, and how late images and views are after them."""
+    flight_s = max(4.0, 2.0 * options.rounds)
+    results: list[BenchResult] = []
+    with tempfile.TemporaryDirectory(prefix="skyrelief-slow-") as name:
+        folder = Path(name)
+        make_video(folder / "flight.mp4", round(flight_s * FPS))
+        save_camera(folder / "camera.yaml", Camera(K, np.zeros(5), SIZE))
+        subprocess.run(python_command("service.cli", "warm-up"), check=True, capture_output=True)
+        for words, share in SHARES.items():
+            looks = fly(folder, share, options.backend)
+            results += figures(words, looks)
+    return results
+
+
+class Look(NamedTuple):
+    """The daemon's status at a time of the flight."""
+
+    at_s: float
+    level: int
+    name: str
+    age_s: float  # of the newest image when its work began
+    frames: int  # passed on
+    late: int  # images that nothing took in time
+    keyframes: int
+    late_views: int
+
+
+def figures(words: str, looks: list[Look]) -> list[BenchResult]:
+    """Steps, and what was late once they were taken."""
+    steps = [
+        f"{look.name} at {look.at_s:.0f} s"
+        for before, look in pairwise(looks)
+        if look.level != before.level
+    ]
+    settled = [look for look in looks if look.at_s >= looks[-1].at_s - SETTLED_S]
+    first, last = settled[0], settled[-1]
+    frames, views = last.frames - first.frames, last.keyframes - first.keyframes
+    late, late_views = last.late - first.late, last.late_views - first.late_views
+    age_s = float(np.percentile([look.age_s for look in settled], 95))
+    allowed = "the ladder's limit"
+    note = "; ".join(steps) or "no step"
+    return [
+        BenchResult(f"{words}: steps of the ladder", last.level, "", note=note),
+        BenchResult(f"{words}: age of an image as its work begins, 95 %", age_s, "s",
+                    peer=allowed, peer_value=OLDEST_S),
+        BenchResult(f"{words}: images missed", 100.0 * late / max(frames + late, 1), "%",
+                    peer=allowed, peer_value=100.0 * LATE_FRAMES,
+                    note=f"{last.late} of {last.frames + last.late} in the whole flight"),
+        BenchResult(f"{words}: views dropped", 100.0 * late_views / max(views + late_views, 1), "%",
+                    peer=allowed, peer_value=100.0 * LATE_VIEWS,
+                    note=f"{last.keyframes} keyframes in {last.at_s:.0f} s"),
+    ]  # fmt: skip
+
+
+def fly(folder: Path, share: float, backend: str) -> list[Look]:
+    """The daemon's status through the flight; OutsideError when it ends or never begins."""
+    (at_status,) = free_ports(1)
+    settings = {
+        "camera.source": f"file:{folder / 'flight.mp4'}",
+        "camera.model": folder / "camera.yaml",
+        "camera.readout_ms": 0,
+        "scan.folder": folder / f"scans-{share:g}",
+        "scan.start": "on-boot",
+        "scan.assumed_agl_m": HEIGHT_M,
+        "health.http": f"127.0.0.1:{at_status}",
+        "compute.backend": backend,
+    }
+    words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+    log = folder / f"run-{share:g}.log"
+    with log.open("wb") as said:
+        process = subprocess.Popen(
+            python_command("service.cli", "run", *words), stdin=subprocess.DEVNULL, stdout=said,
+            stderr=said, start_new_session=True,
+        )  # fmt: skip
+    try:
+        with slowed(process.pid, share):
+            return list(_looks(process, f"http://127.0.0.1:{at_status}/status", log))
+    finally:
+        end_process(process, 60.0)
+
+
+def _looks(process: subprocess.Popen[bytes], url: str, log: Path) -> Iterator[Look]:
+    """From the first image of the scan to its last."""
+    due_s = time.monotonic() + START_S
+    began_s = 0.0
+    while True:
+        if process.poll() is not None:
+            last = (log.read_text(errors="replace").strip().splitlines() or [""])[-1]
+            raise OutsideError(
+                f"bench slow: skyrelief run ended, code {process.returncode}: {last}"
+            )
+        if not began_s and time.monotonic() > due_s:
+            raise OutsideError(f"bench slow: no scan within {START_S:g} s")
+        status: dict[str, Any] = {}
+        with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=10) as answer:
+            status = json.load(answer)
+        load = status.get("load", {})
+        if status.get("frames") and "frame_age_s" in load and status["state"] == "scanning":
+            began_s = began_s or time.monotonic()
+            yield Look(
+                time.monotonic() - began_s, load["level"], load["name"], load["frame_age_s"],
+                status["frames"], load["frames_late"], status["clouds"], load["views_late"],
+            )  # fmt: skip
+        elif began_s and status:
+            return
+        time.sleep(LOOK_S)
+
+
+@contextmanager
+def slowed(pid: int, share: float) -> Iterator[None]:
+    """The process runs only for this share of each :data:`PERIOD_S`."""
+    ended = threading.Event()
+
+    def hold() -> None:
+        with contextlib.suppress(ProcessLookupError):
+            while not ended.wait(share * PERIOD_S):
+                os.kill(pid, signal.SIGSTOP)
+                time.sleep((1.0 - share) * PERIOD_S)
+                os.kill(pid, signal.SIGCONT)
+
+    thread = threading.Thread(target=hold, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
