@@ -21,7 +21,7 @@ from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import PairDepth, carry, fuse, label_noise, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
-from recon.tracking.frame import Frame
+from recon.tracking.frame import NO_IMAGE, Frame
 from recon.tracking.matching import build_pyramid
 from recon.types import (
     F32,
@@ -102,7 +102,8 @@ class DenseStereo:
         self.pairs = 0
 
     def __call__(self, view: StereoView) -> tuple[DepthMap | None, U8]:
-        """Depth in units of the odometry, None where no pair can be used, and (h, w, 3) BGR."""
+        """Depth in units of the odometry and (h, w, 3) BGR; None and no image where no pair can be
+        used."""
         config = self._config  # another thread may set it meanwhile
         H, W = view.image.gray.shape
         w, h = size_px = config.width_px, round(config.width_px * H / W)
@@ -123,6 +124,8 @@ class DenseStereo:
                 found = [*depths.values()]
                 self._noise = label_noise(found) or self._noise
                 depth = fuse(found, K, T_odom_camera, self._dense.fusion, self._noise)
+        if depth is None:
+            return None, NO_IMAGE
         bgr = cv2.resize(at_middle_row(view.image, view.bgr), size_px, interpolation=cv2.INTER_AREA)
         return depth, np.asarray(bgr, np.uint8)
 

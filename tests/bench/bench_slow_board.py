@@ -1,10 +1,12 @@
 """``make bench ARGS=slow``: the load ladder on a board of four slow cores, emulated here.
 
-``skyrelief run`` scans a recording of 1280x720 at 30 images a second, decoding included, at its
-own pace, while all its threads stand still for a share of every 20 ms. On two cores, half of the
-time is in all what four cores of a quarter of this machine's speed do, with faster single threads;
-a quarter of the time is the speed of those cores, two of them. The board lies between. Nothing is
-said of its caches and its memory. The peer of each figure is what the ladder allows.
+``skyrelief run`` scans a simulated flight of 1280x720 at 30 images a second, sent to it as H.264
+with its telemetry, while all its threads stand still for a share of every 20 ms. On two cores, half
+of the time is in all what four cores of a quarter of this machine's speed do, with faster single
+threads; a quarter of the time is the speed of those cores, two of them. The board lies between.
+Nothing is said of its caches and its memory. The peer of a figure is what the ladder allows.
+
+make bench ARGS="slow --flight FLIGHT" plays a flight of ``skyrelief simulate``.
 """
 
 from __future__ import annotations
@@ -19,17 +21,15 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from bench_options import DataOptions
 
-from recon.types import Camera
-from service.bench import BenchOptions, BenchResult
-from service.bench.pipeline import FPS, HEIGHT_M, SIZE, K, make_video
-from service.cameras.camera_file import save_camera
+from service.bench import BenchResult
 from service.daemon.load_shedding import LATE_FRAMES, LATE_VIEWS, OLDEST_S
 from service.errors import OutsideError
 from service.listener import free_ports
@@ -40,22 +40,31 @@ PERIOD_S, LOOK_S = 0.02, 0.5
 START_S = 240.0
 """For a slow start; kernels are compiled before."""
 SETTLED_S = 20.0
-"""At the end of the flight the ladder has taken its steps."""
+"""At the end the ladder has taken its steps."""
 
 
-def run(options: BenchOptions) -> list[BenchResult]:
+def run(options: DataOptions) -> list[BenchResult]:
     """Of each share: the steps of the ladder, and how late images and views are after them."""
-    flight_s = max(4.0, 2.0 * options.rounds)
     results: list[BenchResult] = []
     with tempfile.TemporaryDirectory(prefix="skyrelief-slow-") as name:
-        folder = Path(name)
-        make_video(folder / "flight.mp4", round(flight_s * FPS))
-        save_camera(folder / "camera.yaml", Camera(K, np.zeros(5), SIZE))
-        subprocess.run(python_command("service.cli", "warm-up"), check=True, capture_output=True)
+        flight = options.flight
+        if flight is None:
+            flight = Path(name) / "flight"
+            size = ("--size", "1280x720", "--fps", "30", "--duration-s", "30")
+            _done("simulate", "--out", str(flight), *size)
+        _done("warm-up")
         for words, share in SHARES.items():
-            looks = fly(folder, share, options.backend)
+            folder = Path(name) / f"{share:g}"
+            folder.mkdir()
+            with ExitStack() as open_now:
+                watched_s = 2.0 * options.rounds
+                looks = fly(folder, flight, share, options.backend, watched_s, open_now)
             results += figures(words, looks)
     return results
+
+
+def _done(*words: str) -> None:
+    subprocess.run(python_command("service.cli", *words), check=True, stdin=subprocess.DEVNULL)
 
 
 class Look(NamedTuple):
@@ -98,57 +107,67 @@ def figures(words: str, looks: list[Look]) -> list[BenchResult]:
     ]  # fmt: skip
 
 
-def fly(folder: Path, share: float, backend: str) -> list[Look]:
-    """The daemon's status through the flight; OutsideError when it ends or never begins."""
-    (at_status,) = free_ports(1)
+def fly(
+    folder: Path, flight: Path, share: float, backend: str, watched_s: float, open_now: ExitStack
+) -> list[Look]:
+    """The daemon's status, watched for so long from the first image on."""
+    at_status, video, telemetry = free_ports(3)
     settings = {
-        "camera.source": f"file:{folder / 'flight.mp4'}",
-        "camera.model": folder / "camera.yaml",
+        "camera.source": f"stream:udp://127.0.0.1:{video}",
+        "camera.model": flight / "camera.yaml",
         "camera.readout_ms": 0,
-        "scan.folder": folder / f"scans-{share:g}",
+        "mavlink.links": f'["udpin:127.0.0.1:{telemetry}"]',
+        "scan.folder": folder / "scans",
         "scan.start": "on-boot",
-        "scan.assumed_agl_m": HEIGHT_M,
         "health.http": f"127.0.0.1:{at_status}",
         "compute.backend": backend,
     }
-    words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-    log = folder / f"run-{share:g}.log"
+    process = open_now.enter_context(
+        _process(folder / "run.log", "run", *(
+            word for key, value in settings.items() for word in ("--set", f"{key}={value}")
+        ))
+    )  # fmt: skip
+    open_now.enter_context(
+        _process(folder / "camera.log", "simulate", "--out", str(flight), "--live", "--loop",
+                 "--video-to", f"udp://127.0.0.1:{video}?pkt_size=1316",
+                 "--mavlink-to", f"127.0.0.1:{telemetry}")
+    )  # fmt: skip
+    with slowed(process.pid, share):
+        return list(_looks(process, f"http://127.0.0.1:{at_status}/status", folder, watched_s))
+
+
+@contextmanager
+def _process(log: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
     with log.open("wb") as said:
         process = subprocess.Popen(
-            python_command("service.cli", "run", *words), stdin=subprocess.DEVNULL, stdout=said,
+            python_command("service.cli", *words), stdin=subprocess.DEVNULL, stdout=said,
             stderr=said, start_new_session=True,
         )  # fmt: skip
     try:
-        with slowed(process.pid, share):
-            return list(_looks(process, f"http://127.0.0.1:{at_status}/status", log))
+        yield process
     finally:
         end_process(process, 60.0)
 
 
-def _looks(process: subprocess.Popen[bytes], url: str, log: Path) -> Iterator[Look]:
-    """From the first image of the scan to its last."""
-    due_s = time.monotonic() + START_S
-    began_s = 0.0
-    while True:
-        if process.poll() is not None:
-            last = (log.read_text(errors="replace").strip().splitlines() or [""])[-1]
-            raise OutsideError(
-                f"bench slow: skyrelief run ended, code {process.returncode}: {last}"
-            )
-        if not began_s and time.monotonic() > due_s:
-            raise OutsideError(f"bench slow: no scan within {START_S:g} s")
+def _looks(
+    process: subprocess.Popen[bytes], url: str, folder: Path, watched_s: float
+) -> Iterator[Look]:
+    """OutsideError when the daemon ends, or no scan begins."""
+    due_s, began_s = time.monotonic() + START_S, 0.0
+    while not began_s or time.monotonic() < began_s + watched_s:
+        if process.poll() is not None or (not began_s and time.monotonic() > due_s):
+            lines = (folder / "run.log").read_text(errors="replace").strip().splitlines() or [""]
+            raise OutsideError(f"bench slow: no scan; code {process.poll()}: {lines[-1]}")
         status: dict[str, Any] = {}
         with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=10) as answer:
             status = json.load(answer)
         load = status.get("load", {})
-        if status.get("frames") and "frame_age_s" in load and status["state"] == "scanning":
+        if status.get("frames") and "frame_age_s" in load:
             began_s = began_s or time.monotonic()
             yield Look(
                 time.monotonic() - began_s, load["level"], load["name"], load["frame_age_s"],
                 status["frames"], load["frames_late"], status["clouds"], load["views_late"],
             )  # fmt: skip
-        elif began_s and status:
-            return
         time.sleep(LOOK_S)
 
 
