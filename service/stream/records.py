@@ -41,7 +41,7 @@ class ScanHeader:
     configuration: dict[str, Any] = field(default_factory=dict)
     software: validity.Text = ""
     georeference: validity.Text = "none"  # "gnss", "exif" or "none"
-    vertical_datum: validity.Text = ""  # of heights as flown, where the images' tags state it
+    vertical_datum: validity.Text = ""  # of heights as flown, where tags or telemetry state it
     notes: validity.Notes = ()
     run_id: validity.RunId = ""  # 32 hexadecimal digits, random for each run; old scans have none
 
