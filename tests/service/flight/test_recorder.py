@@ -10,7 +10,10 @@ from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
+from onboard import real_scan
 
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.samples import PositionSample
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
@@ -22,6 +25,7 @@ from recon.poses import sigma_m
 from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
+from service.cameras.source import CameraFrame
 from service.flight.recorder import REPLAYED, Recorder
 from service.scans.drawing import debug_path, load_debug
 from service.stream.images import IMAGE_SHARE
@@ -246,3 +250,19 @@ def larger(one: Keyframe, factor: int, rng: np.random.Generator) -> Keyframe:
         scaled_K(depth.K, factor, factor), depth.T_world_camera,
     )  # fmt: skip
     return replace(one, depth=large, bgr=enlarged(one.bgr), fresh=enlarged(one.fresh))
+
+
+def test_the_datum_of_a_logs_altitudes_is_the_scans(tmp_path: Path) -> None:
+    """Else heights above the ellipsoid, as a GoPro has them, are called above sea level."""
+    history = VehicleHistory()
+    history.vertical_datum = "ellipsoid"
+    for k in range(3):
+        history.add(PositionSample(None, 33.127, -117.327, -23.0, None, None), k * 100_000_000)
+    scan = real_scan(tmp_path / "scan", history=history)
+    image = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
+    for k in range(2):
+        scan.feed(CameraFrame(image, k * 100_000_000, k, None, f"frame {k}"))
+    scan.mapper.finish()
+    header = scan.store.header
+    scan.store.close()
+    assert (header.vertical_datum, header.origin_alt_amsl_m) == ("ellipsoid", -23.0)
