@@ -29,9 +29,10 @@ def written(folder: Path, kind: str) -> Path:
         return export(scan, kind, None, ExportOptions(cell_m=0.25))
 
 
-def features(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def features(scan_dir: Path, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """What GDAL says of the only layer, and its columns."""
     pyogrio = pytest.importorskip("pyogrio")
+    path = written(scan_dir, kind)
     facts = pyogrio.read_info(path, force_total_bounds=True)
     meta, _, _, columns = pyogrio.raw.read(path)
     return facts, dict(zip(meta["fields"], columns, strict=True))
@@ -39,7 +40,7 @@ def features(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @pytest.mark.parametrize(("kind", "system"), [("contours", "EPSG:4979"), ("gpkg", EPSG)])
 def test_gdal_reads_contours(hillside: Path, kind: str, system: str) -> None:
-    facts, columns = features(written(hillside, kind))
+    facts, columns = features(hillside, kind)
     assert facts["crs"] == system and facts["geometry_type"] == "LineString Z"
     assert set(columns["height_amsl_m"]) == {409.0, 410.0, 411.0}
     is_index = columns["index" if kind == "contours" else "is_index"].astype(bool)
@@ -47,8 +48,8 @@ def test_gdal_reads_contours(hillside: Path, kind: str, system: str) -> None:
 
 
 def test_gdal_reads_the_same_lines_as_dxf(hillside: Path) -> None:
-    gpkg, _ = features(written(hillside, "gpkg"))
-    dxf, columns = features(written(hillside, "dxf"))
+    gpkg, _ = features(hillside, "gpkg")
+    dxf, columns = features(hillside, "dxf")
     labels = columns["Layer"] == "CONTOUR_LABELS"
     assert set(columns["Layer"]) == {f"CONTOUR_{n}" for n in ("409", "410", "411", "LABELS")}
     assert set(columns["Text"][labels]) == {"410"} and (~labels).sum() == gpkg["features"]
@@ -57,7 +58,7 @@ def test_gdal_reads_the_same_lines_as_dxf(hillside: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["geojson", "kml"])
 def test_gdal_reads_the_flight(hillside: Path, kind: str) -> None:
-    facts, columns = features(written(hillside, kind))
+    facts, columns = features(hillside, kind)
     lat, lon, _ = HillsideFlight().origin
     west, south, east, north = facts["total_bounds"]
     assert facts["crs"] == "EPSG:4326"
