@@ -24,7 +24,7 @@ from service.ground.portal import Portal, PortalConfig
 SIZES = {"desktop": (1440, 900), "phone": (390, 844)}
 HIGH_PX, GAP_PX, LABEL_PX = 300, 8, 18
 """A state on the sheet."""
-WAIT_S, STILL_S = 120.0, 40.0
+WAIT_S, STILL_S = 120.0, 60.0
 PRESS = "[...document.querySelectorAll('button')].find(b => b.textContent === '{}').click()"
 COLOUR = (
     "(s => {{ s.value = '{}'; s.dispatchEvent(new Event('change', {{ bubbles: true }})) }})"

@@ -99,6 +99,22 @@ def test_the_cloud_grows_and_moves_while_one_looks(
     assert [u for u in outside if not u.startswith(("blob:", "about:", "chrome"))] == []
 
 
+def test_the_scale_of_heights_follows_what_comes(
+    browser: Browser, portal: Portal, scans: Path, house: HouseFlight
+) -> None:
+    browser.open("about:blank")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait("document.body.dataset.image === '4'")
+    browser.page.select_option('[aria-label="colour by"]', "height")
+    top = "parseFloat(document.querySelector('.legend:not([hidden])').lastChild.textContent)"
+    before = browser.wait(top)
+    with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+        one = house.keyframe(5, 30.0)
+        one.depth.T_world_camera[2, 3] += 30.0  # over a hill
+        scan.add_keyframe(5, encode(one, one.time_ns))
+    assert browser.wait(f"{top} > {before + 20.0} && {top}") < before + 40.0
+
+
 def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
     browser.open(portal.url)

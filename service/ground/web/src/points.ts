@@ -127,6 +127,9 @@ export class Cloud implements Gradual {
   private readonly past = new THREE.Group();
   private readonly before = new Before();
   private isStale = false;
+  private isUnscaled = false; // something came since the range of the colours was set
+  /** Called when the range of the colours has followed what came. */
+  scaled: () => void = () => undefined;
   /** Called when there are parts to colour by. */
   named = (): void => undefined;
   private readonly moves = new Map<number, THREE.Matrix4>();
@@ -140,6 +143,7 @@ export class Cloud implements Gradual {
   private measured = false;
   private groundStale = false;
   private groundAt = -Infinity;
+  private scaledAt = -Infinity;
   private readonly shared = {
     size: { value: 1.3 },
     thin: { value: 1 },
@@ -187,7 +191,7 @@ export class Cloud implements Gradual {
   /** Adds a keyframe, in place of the one with the same number; of one that is withdrawn nothing stays. */
   add(chunk: Chunk): void {
     this.remove(chunk.seq);
-    this.groundStale = true;
+    this.groundStale = this.isUnscaled = true;
     if (isVoid(chunk)) return;
     const { xyz, rgb, sigma, views, unit_m } = pointsOf(chunk);
     const geometry = new THREE.BufferGeometry();
@@ -317,7 +321,12 @@ export class Cloud implements Gradual {
       this.ground.build(this.samples);
       this.groundAt = performance.now();
     }
-    return this.compare() || grew;
+    const isRescaled = this.isUnscaled && this.showsFigures && performance.now() - this.scaledAt > GROUND_MS;
+    if (isRescaled) {
+      this.colour(COLOURS[this.shared.mode.value]!);
+      this.scaled();
+    }
+    return this.compare() || grew || isRescaled;
   }
 
   private compare(): boolean {
@@ -377,6 +386,8 @@ export class Cloud implements Gradual {
   }
 
   colour(mode: Colour): void {
+    this.isUnscaled = false;
+    this.scaledAt = performance.now();
     this.shared.mode.value = COLOURS.indexOf(mode);
     if (mode === "height") this.heightScale();
     if (mode === "sigma") this.sigmaScale();

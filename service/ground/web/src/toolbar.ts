@@ -80,6 +80,9 @@ function colours({ cloud, legend }: Parts): HTMLSelectElement {
   select.setAttribute("aria-label", "colour by");
   select.onchange = () => {
     cloud.colour(select.value as Colour);
+    cloud.scaled();
+  };
+  cloud.scaled = () => {
     const words = cloud.scale();
     const keys = cloud.keys();
     legend.hidden = words === null && !keys.length;
