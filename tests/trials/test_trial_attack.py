@@ -237,7 +237,7 @@ def test_hostile_datalink_next_to_honest_drones(tmp_path: Path, record: Row) -> 
         lost = [one.lost(ground) for one in drones]
         code = ground.stop()
     record(
-        f"attack: {SOAK_MINUTES:g} minutes of hostile datalink next to two honest drones",
+        f"attack: {SOAK_MINUTES:g} minutes of hostile datalink beside two honest drones",
         sum(tally.values()),
         f"{tally['records']} records, {tally['reports']} reports, {tally['requests']} requests; "
         f"worst age of an honest pose {worst_s:.2f} s; the ground's memory "
