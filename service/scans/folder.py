@@ -255,12 +255,14 @@ class _Files:
         """Write preview, thumbnail and report; returns the content of scan.json."""
         with self.failures.noted(PREVIEW):
             self._raster = surface(self._fused, self._cell_m)
+        release_memory()  # what each step leaves is not there beside the next
         summary = self.summary(extra)
         poses = main_poses(self._poses, stretches_apart(self._store))
         maps = None
         with self.failures.noted(PREVIEW):
             if self._raster is not None:
                 maps = maps_of(summary, poses, self._raster)
+            release_memory()
             lines = [*key_figures(summary), *filter(None, [self._left_out])]
             self._write_image(
                 PREVIEW,
