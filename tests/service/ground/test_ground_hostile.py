@@ -146,7 +146,7 @@ def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(tmp_p
 def test_the_files_of_a_drone_whose_worker_has_failed_are_written_at_the_end(
     tmp_path: Path,
 ) -> None:
-    written = []
+    written: list[Path] = []
 
     def fails(_: ReceivedScan) -> None:
         raise KeyError("made up")
