@@ -108,7 +108,10 @@ def test_the_outline_is_that_of_sloping_ground() -> None:
     scan: Any = SimpleNamespace(raster=lambda _: raster, frame=None)
     camera = Camera(np.array([[60, 0, 40], [0, 60, 30], [0, 0, 1.0]]), np.zeros(5), (80, 60))
     ahead = np.array([-0.6, 0.0, -0.8])  # to the west, down the slope
-    T = se3.compose(np.column_stack([[0, 1.0, 0], np.cross(ahead, [0, 1.0, 0]), ahead]), [0, 0, 20])
+    T = se3.compose(
+        np.column_stack([[0, 1.0, 0], np.cross(ahead, [0, 1.0, 0]), ahead]),
+        np.array([0.0, 0.0, 20.0]),
+    )
     v, u = np.indices((60, 80))
     ways = rays(camera.K, np.column_stack([u.ravel(), v.ravel()]).astype(float)) @ T[:3, :3].T
     far = -20.0 / (ways[:, 2] - 0.3 * ways[:, 0])
