@@ -6,7 +6,7 @@ reference and the meaning of ``T_a_b`` are in :mod:`recon.frames`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -187,6 +187,14 @@ class DepthMap:
     views: U8  # (h, w) how many stereo pairs agree; 0 where depth is NaN
     K: F64  # (3, 3) px of this grid, no distortion
     T_world_camera: F64  # (4, 4)
+
+    def scaled(self, factor: float, T_world_camera: F64) -> DepthMap:
+        """The depth ``factor`` times as far, seen from that pose."""
+        times = np.float32(factor)
+        return replace(
+            self, depth_m=self.depth_m * times, sigma_m=self.sigma_m * times,
+            T_world_camera=T_world_camera,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Protocol
 
-import numpy as np
-
 from recon.backends import Backend, DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
@@ -360,9 +358,5 @@ class Mapper:
 
 def moved(keyframe: Keyframe, pose: Pose) -> Keyframe:
     """The keyframe at another pose, its depth by the scale there."""
-    growth = np.float32(pose.scale / keyframe.pose.scale)
-    depth = replace(
-        keyframe.depth, depth_m=keyframe.depth.depth_m * growth,
-        sigma_m=keyframe.depth.sigma_m * growth, T_world_camera=pose.T_world_camera,
-    )  # fmt: skip
+    depth = keyframe.depth.scaled(pose.scale / keyframe.pose.scale, pose.T_world_camera)
     return replace(keyframe, depth=depth, pose=pose)

@@ -248,10 +248,7 @@ def keyframe_of(
 
     ``depth`` and ``sigma_m`` (h, w) are in units of the odometry.
     """
-    scale = np.float32(pose.scale)
-    metric = DepthMap(
-        depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, pose.T_world_camera
-    )
+    metric = replace(depth, sigma_m=sigma_m).scaled(pose.scale, pose.T_world_camera)
     return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
 
 

@@ -196,7 +196,7 @@ def _with_icp(a: LoopEnd, b: LoopEnd, T_a_b: F64, covariance: F64) -> LoopClosur
     growth = _growth(a, b, T_a_b)
     if growth is None:
         return None
-    b = replace(b, depth=_grown(b.depth, growth))
+    b = replace(b, depth=b.depth.scaled(growth, b.depth.T_world_camera))
     # Depths of one keyframe err together, which the pixels do not show.
     depth = float(np.nanmedian(a.depth.depth_m))
     sigma = float(np.nanmedian(a.depth.sigma_m))
@@ -225,8 +225,3 @@ def _growth(a: LoopEnd, b: LoopEnd, T_a_b: F64) -> float | None:
     ratio = there[inside, 2] / b.depth.depth_m[at[:, 1], at[:, 0]]
     ratio = ratio[np.isfinite(ratio)]
     return float(np.median(ratio)) if len(ratio) >= 50 else None
-
-
-def _grown(depth: DepthMap, growth: float) -> DepthMap:
-    factor = np.float32(growth)
-    return replace(depth, depth_m=depth.depth_m * factor, sigma_m=depth.sigma_m * factor)

@@ -145,11 +145,6 @@ FINE_QUALITY, COARSE_QUALITY = 80, 25  # of JPEG, 1 to 100
 COARSE_WIDTH_PX = 80
 
 
-def _step(rms_m: float) -> float:
-    """Step of inverse depth, 1/m, whose rounding error at the reference is ``rms_m``."""
-    return rms_m * math.sqrt(12.0) / REFERENCE_DEPTH_M**2
-
-
 def encode(keyframe: Keyframe, time_unix_ns: int) -> tuple[bytes, ...]:
     """The layers of ``keyframe``, coarse first; the last one holds everything.
 

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from recon import se3
-from recon.types import F64, DepthMap, Keyframe, Pose
+from recon.types import F64, Keyframe, Pose
 from service.stream import validity
 from service.stream.validity import MAX_DEPTH_M, MAX_HEADER_BYTES, MIN_DEPTH_M
 
@@ -121,16 +121,12 @@ class Repose:
 
     def applied_to(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe at this pose, its depth and sigma scaled; implausible depth is NaN."""
-        depth, scale = keyframe.depth, np.float32(self.scale)
-        T = self.T_world_camera
-        scaled_m = depth.depth_m * scale
+        depth = keyframe.depth.scaled(self.scale, self.T_world_camera)
         with np.errstate(invalid="ignore"):
-            scaled_m[(scaled_m < MIN_DEPTH_M) | (scaled_m > MAX_DEPTH_M)] = np.nan
-        return replace(
-            keyframe,
-            depth=DepthMap(scaled_m, depth.sigma_m * scale, depth.views, depth.K, T),
-            pose=Pose(T, self.covariance, keyframe.pose.sources),
-        )
+            far = (depth.depth_m < MIN_DEPTH_M) | (depth.depth_m > MAX_DEPTH_M)
+        depth.depth_m[far] = np.nan
+        pose = Pose(self.T_world_camera, self.covariance, keyframe.pose.sources)
+        return replace(keyframe, depth=depth, pose=pose)
 
 
 _UPPER = np.triu_indices(6)

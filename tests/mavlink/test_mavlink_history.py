@@ -382,7 +382,7 @@ def test_every_gimbal_frame_leads_to_the_same_attitude() -> None:
             assert angle(earth, of_scipy(head)) < 1e-6, frame
 
 
-@pytest.mark.parametrize("tilt_deg", [-30.0, -89.0, -90.0, -95.0])
+@pytest.mark.parametrize("tilt_deg", [-30.0, -89.0, -90.0, -95.0, 89.0, 90.0])
 def test_servo_angles_are_composed_in_the_order_of_the_servos(tilt_deg: float) -> None:
     roll, tilt = 0.2, math.radians(tilt_deg)
     sent = quaternion.from_rpy(roll, tilt, 0.0)  # as ArduPilot encodes servo angles
@@ -395,13 +395,15 @@ def sway(k: int) -> Quaternion:
     return quaternion.from_rpy(0.1 * math.sin(0.03 * k), 0.08 * math.cos(0.02 * k), 0.5)
 
 
-def gimbal_history(frame: GimbalFrame, yaw_frame: str = "auto") -> VehicleHistory:
-    """A head at 60 degrees down by a mount that really keeps the horizon, sent in a frame."""
+def gimbal_history(
+    frame: GimbalFrame, yaw_frame: str = "auto", turn_rad: float = 0.0
+) -> VehicleHistory:
+    """A head at 60 degrees down by a mount that really keeps the horizon, sent in a frame; the
+    vehicle turns by ``turn_rad`` from sample to sample."""
     history = VehicleHistory(HistoryConfig(yaw_frame=yaw_frame))
-    head = quaternion.from_rpy(0.0, -1.0, 0.5)
     for k in range(400):
-        body = sway(k)
-        q = head
+        body = quaternion.multiply(quaternion.from_rpy(0.0, 0.0, turn_rad * k), sway(k))
+        q = head = quaternion.from_rpy(0.0, -1.0, 0.5 + turn_rad * k)
         if frame is GimbalFrame.BODY:
             q = quaternion.multiply(quaternion.conjugate(body), head)
         elif frame is GimbalFrame.VEHICLE:
@@ -412,13 +414,15 @@ def gimbal_history(frame: GimbalFrame, yaw_frame: str = "auto") -> VehicleHistor
     return history
 
 
+@pytest.mark.parametrize("turn_rad", [0.0, 0.05])
 @pytest.mark.parametrize("frame", [GimbalFrame.EARTH, GimbalFrame.VEHICLE, GimbalFrame.BODY])
-def test_auto_sees_through_a_wrong_claim(frame: GimbalFrame) -> None:
-    history = gimbal_history(frame)
+def test_auto_sees_through_a_wrong_claim(frame: GimbalFrame, turn_rad: float) -> None:
+    history = gimbal_history(frame, turn_rad=turn_rad)
     for k in (50, 155, 333):
         state = history.state_at(T0 + k * 100 * MS + 40 * MS)
         assert state is not None and state.q_ned_gimbal_wxyz is not None
-        assert angle(state.q_ned_gimbal_wxyz, quaternion.from_rpy(0.0, -1.0, 0.5)) < 2e-3
+        truth = quaternion.from_rpy(0.0, -1.0, 0.5 + turn_rad * (k + 0.4))
+        assert angle(state.q_ned_gimbal_wxyz, truth) < 2e-3
         assert "gimbal" in state.sources
 
 
@@ -493,6 +497,17 @@ def test_a_head_that_stands_still_decides_nothing() -> None:
     assert frame_by_images(turns, lambda _: None) is None
     still = frame_by_images(turns, lambda _: (IDENTITY, IDENTITY))
     assert still is not None and not still.decided
+
+
+@pytest.mark.parametrize(("step_deg", "decides"), [(0.02, False), (0.2, True)])
+def test_turns_as_small_as_their_noise_decide_nothing(step_deg: float, decides: bool) -> None:
+    """A camera on a body that leans steadily: each frame puts it elsewhere and turns it alike."""
+    lean = quaternion.from_rpy(math.radians(2.0), 0.0, 0.0)
+    seen = quaternion.from_rpy(math.radians(step_deg), 0.0, 0.0)
+    bodies = {0: lean, S: quaternion.multiply(lean, seen)}
+    verdict = frame_by_images([(0, S, seen)] * 40, lambda t: (IDENTITY, bodies[t]))
+    assert verdict is not None and verdict.decided is decides
+    assert set(verdict.refuted) == ({GimbalFrame.EARTH, GimbalFrame.VEHICLE} if decides else set())
 
 
 def test_a_live_history_waits_for_the_far_side_of_a_frame() -> None:

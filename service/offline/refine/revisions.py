@@ -20,7 +20,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.ground_control import Adjusted
-from recon.types import F64, I64, DepthMap, Keyframe
+from recon.types import F64, I64, Keyframe
 from service.cameras.rig import attitude_of
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
@@ -133,10 +133,8 @@ class Revisions:
         if found is None:
             return None
         now = self._store.repose(found.seq)
-        grown = np.float32(states.scales[k] / (1.0 if now is None else now.scale))
-        d = found.depth
-        depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, states.poses[k])
-        return Keyframe(found.seq, found.time_ns, depth, found.bgr, found.pose, found.fresh)
+        growth = states.scales[k] / (1.0 if now is None else now.scale)
+        return replace(found, depth=found.depth.scaled(growth, states.poses[k]))
 
     def frames(self) -> list[PoseRecord]:
         """All unrefined poses in order of time; of several for one time the newest."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import sigma_m
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose
+from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
 from recon.types import F64, Pose, PosePrior
 
 RNG = np.random.default_rng(4)
@@ -86,6 +87,25 @@ def test_frames_of_a_flight_without_fixes_stand_where_the_odometry_has_them() ->
         np.testing.assert_allclose(pose.T_world_camera, frame_at(seq, north_m).T_odom_camera)
         assert sigma_m(pose) == pytest.approx(3**0.5 * np.hypot(1.0, north_m - 28.0))
         assert pose.sources == ("vision",)
+
+
+def lost(prior: PosePrior) -> Pose | None:
+    frames = FramePoses(empty(), lambda frame: True)
+    return frames.place(Frame(NO_IMAGE, 0, 1, prior, segment=3, state=Tracking.LOST))
+
+
+def test_a_lost_frame_is_placed_by_telemetry_that_knows_its_heading() -> None:
+    """An attitude without compass turns freely about the vertical: no pose is better."""
+    place_m, turn = np.array([3.0, -28.0, 50.0]), se3.so3_exp(np.array([0.1, 0.2, 1.5]))
+    known = PosePrior(turn, 0.02, 0.1, place_m, np.array([2.0, 2.0, 4.0]))
+    pose = lost(known)
+    assert pose is not None
+    np.testing.assert_allclose(pose.T_world_camera, se3.compose(turn, place_m))
+    assert pose.sources == ("attitude", "gnss", "dead reckoning")
+    assert sigma_m(pose) == pytest.approx(24.0**0.5)
+    assert lost(replace(known, sigma_yaw_rad=3.0)) is None
+    assert lost(replace(known, R_world_camera=None)) is None
+    assert lost(replace(known, position_m=None, sigma_position_m=None)) is None
 
 
 def some_pose() -> F64:

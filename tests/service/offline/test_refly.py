@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from pymavlink import mavutil, mavwp  # type: ignore[import-untyped]
 from typer.testing import CliRunner
 
 from recon.surface.coverage import PLACE, CoverageMap
+from recon.surface.raster import Grid
 from recon.types import F64, DepthMap
 from service.cli import app
 from service.errors import InputError
@@ -153,6 +155,34 @@ def test_the_strips_of_ground_hold_every_weak_cell() -> None:
         ]
         assert any(inside)
     assert json.loads(refly.geojson(None, FRAME))["features"] == []
+
+
+SWATH = refly.Swath(64.0, 32.0, 0.0, np.radians(30.0), 448.0, 5.0, HEIGHT_M)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 30.0, 75.0, 120.0])
+def test_lines_in_any_direction_cover_the_cells(heading_deg: float) -> None:
+    """A long field along the heading: two lines side by side, over all of it and not far beyond."""
+    heading = np.radians(heading_deg)
+    way = np.array([np.cos(heading), np.sin(heading)])
+    side = np.array([-way[1], way[0]])
+    s, t = (a.ravel() for a in np.meshgrid(np.arange(0.0, 300.0, 2.0), np.arange(0.0, 90.0, 2.0)))
+    cells = s[:, None] * way + t[:, None] * side
+    lines = refly.lines_over(cells, replace(SWATH, heading_rad=heading), 0.2)
+    assert len(lines) == 2
+    for line in lines:
+        assert np.ptp(line @ side) < 1e-9 and np.ptp(line @ way) == pytest.approx(298.0 + 32.0)
+    off = np.abs(cells @ side - (lines[:, 0] @ side)[:, None]).min(axis=0)
+    assert off.max() == pytest.approx(22.0)
+
+
+@pytest.mark.parametrize(("side_cells", "kept"), [(10, 0), (20, 1)])
+def test_weak_ground_of_a_small_part_of_an_image_is_ignored(side_cells: int, kept: int) -> None:
+    swath, grid = replace(SWATH, across_m=400.0, along_m=300.0), Grid(0.0, 200.0, 2.0, (100, 100))
+    weak = np.zeros(grid.shape, np.bool_)
+    weak[30 : 30 + side_cells, 30 : 30 + side_cells] = True  # of 120,000 m² times 0.5%
+    patches = refly.weak_patches(weak, grid, swath)
+    assert [len(patch) for patch in patches] == [side_cells**2] * kept
 
 
 def test_nothing_weak_needs_no_flight() -> None:
