@@ -264,6 +264,19 @@ def test_a_view_that_waited_while_the_next_segment_grew_is_confirmed_by_its_own(
     assert given == [0, 1, 2, 3]
 
 
+def test_a_view_knows_the_earlier_ones_of_its_segment_alone() -> None:
+    """Their poses say how far the odometry has moved them since; another segment's say nothing."""
+    keys = list[Frame]()
+    views, earlier = stereo_camera(keys), dict[int, set[int]]()
+    for i in range(8):
+        plain = frame(i, 5.0 * i, segment=i // 4)
+        keys.append(plain.keyframe)
+        views.take(replace(plain, state=Tracking.KEYFRAME if i % 4 else Tracking.STARTED))
+        earlier |= {view.seq: set(view.earlier) for view in views.ready()}
+    assert {5, 6} <= earlier.keys() and earlier[6] >= {5}
+    assert all(seq // 4 == other // 4 for seq, others in earlier.items() for other in others)
+
+
 @pytest.mark.parametrize("exposure_s", [0.0, 0.05])
 def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: float) -> None:
     """1 m in each tenth of a second, 50 m above points 100 m further on, at 30 px."""
