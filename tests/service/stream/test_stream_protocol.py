@@ -241,6 +241,17 @@ def test_detail_that_does_not_fit_waits_on_disk(tmp_path: Path) -> None:
     assert len(world.store.numbers().get("k0", RangeSet())) > 0
 
 
+@pytest.mark.parametrize("rate_bytes_s", [1e3, 1e5, 3e5, 1e7])
+def test_a_part_fits_into_the_bucket_with_what_carries_it(rate_bytes_s: float) -> None:
+    """Its message costs what the bucket holds and no more; or it is the largest part."""
+    bucket = TokenBucket(rate_bytes_s, 0.0)
+    part = bucket.part_bytes
+    assert wire_bytes(part) <= bucket.depth_bytes
+    assert part == 16_384 or wire_bytes(part) > 0.95 * bucket.depth_bytes
+    # A header of TCP/IP for each begun segment of 1,400 bytes.
+    assert [wire_bytes(size) - size for size in (1, 1320, 1321)] == [132, 132, 184]
+
+
 def test_a_missing_part_is_asked_for_alone(tmp_path: Path) -> None:
     world = World(tmp_path)
     world.produce(0, 1)
