@@ -142,7 +142,7 @@ def values(rgb: U8) -> Array:
     """(256,) how often each value occurs in colours, some at a time: counting takes eight times
     their memory."""
     parts = np.array_split(rgb.ravel(), 1 + rgb.size // COUNTED)
-    return np.sum([np.bincount(part, minlength=256) for part in parts], axis=0)
+    return np.asarray(np.sum([np.bincount(part, minlength=256) for part in parts], axis=0))
 
 
 def exposure(counts: Array) -> float:
