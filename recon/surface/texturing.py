@@ -61,7 +61,6 @@ def texture(
     label = np.where(slot >= 0, found.view[np.arange(len(slot)), slot], -1).astype(np.int32)
     progress("levelling exposures")
     gains = levels(found, len(views))
-    gains *= usual_brightness(found, slot, gains)[:, None]
     fade_view, fade_share = fading(mesh.faces, label, len(mesh.vertices_m), len(views))
     progress("packing the atlas")
     layout = lay_out(mesh, views, label, neighbours, largest_px)
@@ -250,21 +249,6 @@ def levels(found: TriangleViews, views: int) -> F32:
         solved = _solve(a, b, colour_a[:, channel], colour_b[:, channel], views)
         out[:, channel] = solved
     return out
-
-
-def usual_brightness(found: TriangleViews, slot: I32, gains: F32) -> F32:
-    """(3,) how much brighter all views together show the triangles than the chosen ones, levelled.
-
-    Lenses are darker off their middle, so chosen views are no fair sample.
-    """
-    is_seen = found.view >= 0
-    shared = np.flatnonzero((slot >= 0) & is_seen[:, 1])
-    count = is_seen[shared].sum(axis=1)
-    usual = (found.bgr[shared] * is_seen[shared, :, None]).sum(axis=1) / count[:, None]
-    chosen = gains[found.view[shared, slot[shared]]]
-    shown = found.bgr[shared, slot[shared]] * chosen[..., 0] + chosen[..., 1]
-    totals = usual.sum(axis=0, dtype=np.float64) + 1.0, shown.sum(axis=0, dtype=np.float64) + 1.0
-    return np.asarray(totals[0] / totals[1], np.float32)
 
 
 def _pairs(found: TriangleViews) -> tuple[I32, I32, F64, F64]:

@@ -105,21 +105,6 @@ def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
         assert np.abs(np.polyval(line, truth[:, channel]) - colour[inner, channel]).max() < 8.0
 
 
-def test_the_texture_is_as_bright_as_the_images_are_on_average() -> None:
-    views = [image(np.array([x, 0.0, 14.0])) for x in (-6.0, -3.0, 0.0, 3.0, 6.0)]
-    far = np.hypot(*(np.indices((240, 320)) - np.array([[[119.5]], [[159.5]]]))) / 200.0
-    for view in views:  # the lens is darker off its middle
-        view.bgra[..., :3] = np.rint(view.bgra[..., :3] * (1.0 - 0.3 * far**2)[..., None])
-    done = texture(sheet(), views)
-    colour = shown(done.mesh, done.image)[1].mean(axis=1)
-    found = look(sheet(), views)
-    seen = found.view >= 0
-    shared = seen[:, 1]
-    usual = (found.bgr.mean(axis=2) * seen)[shared].sum(axis=1) / seen[shared].sum(axis=1)
-    assert len(colour) == len(shared)
-    assert abs(colour[shared].mean() / usual.mean() - 1.0) < 0.02
-
-
 def test_a_triangle_narrower_than_a_texel_has_colours_all_along() -> None:
     thin = np.array([[0.0, 0.0, 0.0], [3.0, 1.3, 0.0], [3.0, 1.31, 0.0]])
     faces = np.array([[0, 1, 2]], np.int32)
