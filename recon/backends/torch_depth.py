@@ -36,6 +36,7 @@ from recon.stereo.reprojection import (
     MIN_NOISE,
     NOISE_STRIDE,
     PAIRS_CORRELATION,
+    DepthFusionConfig,
 )
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
 from recon.stereo.upsampling import MIN_CONFIDENCE, UpsamplingConfig
@@ -78,10 +79,7 @@ class DensePath:
         found = torch.zeros((2, pairs, size_px[1], size_px[0]), device=self.device)
 
         def fused() -> tuple[Tensor, Tensor, Tensor]:
-            depth, sigma = found
-            noise = label_noise(depth, sigma)
-            fused, error, views = fuse(depth, sigma * noise.clamp(min=1.0), self.stages.fusion)
-            return fused, error * noise.clamp(max=1.0), views
+            return fused_pairs(found[0], found[1], self.stages.fusion)
 
         return found, Plan(self.device, fused, [])
 
@@ -126,6 +124,17 @@ def pair_depth(
     else:
         sizes = torch.cat([true[:2], true[:2]])
     return reproject(px, confidence, geometry, sizes, size_px, MIN_REPROJECTED)
+
+
+def fused_pairs(
+    depth: Tensor, sigma: Tensor, config: DepthFusionConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`recon.stereo.reprojection.fuse` of pairs (P, h, w), with the noise they show."""
+    noise = label_noise(depth, sigma)
+    is_refuted = ~(fuse(depth, sigma, config)[2] > 0).any()
+    out, error, views = fuse(depth, sigma * noise.clamp(min=1.0), config)
+    out, error = (torch.where(is_refuted, torch.nan, a) for a in (out, error))
+    return out, error * noise.clamp(max=1.0), torch.where(is_refuted, 0, views)
 
 
 def label_noise(depth: Tensor, sigma: Tensor) -> Tensor:

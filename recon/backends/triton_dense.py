@@ -874,8 +874,7 @@ def fuse_kernel(
     depth, sigma, out, error, out_views, balance, plane, agree, max_share, single, min_share,
     PAIRS: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
-    """``balance`` grows by the pixels where no two readings come near each other, less the others
-    that have several."""
+    """``balance`` grows by the pixels that are contradicted less those that two views confirm."""
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < plane
     best = tl.full((PIXELS,), -1, tl.int32)
@@ -921,6 +920,5 @@ def fuse_kernel(
     tl.store(out + at, tl.where(seen, z, float("nan")).to(tl.float32), mask=here)
     tl.store(error + at, tl.where(seen, e, float("nan")).to(tl.float32), mask=here)
     tl.store(out_views + at, tl.where(contradicted, 0, views).to(tl.uint8), mask=here)
-    several = here & (count > 1)
-    votes = (several & (close == 1)).to(tl.int32) - (several & (close > 1)).to(tl.int32)
+    votes = (here & contradicted).to(tl.int32) - (here & (views >= 2)).to(tl.int32)
     tl.atomic_add(balance, tl.sum(votes, 0))

@@ -253,28 +253,37 @@ def fuse(
     sigma is the larger of the propagated one and the spread inside the group. ``noise`` multiplies
     all sigmas; less than 1 only those of the result, as clear images err seldom and then far: pairs
     that a narrower gate leaves out are good ones. ``views`` counts the group. Where several pairs
-    read and none comes within ``max_sigma_share`` of another nothing is known. Where more pixels
-    are such than have two that do, however large sigma is, what they see is not a rigid surface, or
-    their motion is false, and the whole map is unknown: of readings with an honest sigma below that
-    share most come so near.
+    read and none comes within ``max_sigma_share`` of another nothing is known. Where that is so at
+    more pixels than those at which two agree within usual sigmas, what they see is not a rigid
+    surface, or their motion is false, which no noise excuses, and the whole map is unknown.
     """
     depth = np.stack([p.depth_m for p in pairs])
-    sigma = np.float32(max(noise, 1.0)) * np.stack([p.sigma_m for p in pairs])
+    sigma = np.stack([p.sigma_m for p in pairs])
+    out = _fused(depth, sigma, K, T_world_camera, config)
+    if noise > 1.0 and out.views.any():
+        out = _fused(depth, np.float32(noise) * sigma, K, T_world_camera, config)
+    out.sigma_m[:] *= np.float32(min(noise, 1.0))
+    return out
+
+
+def _fused(
+    depth: F32, sigma: F32, K: F64, T_world_camera: F64, config: DepthFusionConfig
+) -> DepthMap:
+    """As :func:`fuse`, of depths and sigmas (P, h, w)."""
     shape = depth.shape[1:]
     out = DepthMap(
         np.empty(shape, np.float32), np.empty(shape, np.float32), np.zeros(shape, np.uint8), K,
         T_world_camera,
     )  # fmt: skip
-    close = np.zeros(shape, np.uint8)
     parallel_for(
         _fuse, shape[0], depth, sigma, config.agree_sigmas, config.single_view_sigma,
         config.max_sigma_share, config.min_sigma_share, out.depth_m, out.sigma_m, out.views,
-        close,
     )  # fmt: skip
-    out.sigma_m[:] *= np.float32(min(noise, 1.0))
-    if np.count_nonzero(close == 1) > np.count_nonzero(close > 1):
+    contradicted = np.isnan(out.depth_m) & (out.views > 0)
+    refuted = np.count_nonzero(contradicted) > np.count_nonzero(out.views >= 2)
+    out.views[contradicted | refuted] = 0
+    if refuted:
         out.depth_m[:] = out.sigma_m[:] = np.nan
-        out.views[:] = 0
     return out
 
 
@@ -308,9 +317,7 @@ def _fuse(
     out_depth: Any,
     out_sigma: Any,
     out_views: Any,
-    out_close: Any,
 ) -> None:  # pragma: no cover - compiled
-    """``out_close`` counts the readings near the group's centre, where there are several."""
     P, _, width = depth.shape
     square = agree_sigmas * agree_sigmas
     for v in range(begin, end):
@@ -339,13 +346,13 @@ def _fuse(
                     mean += weight * apart
                     squares += weight * apart * apart
                     views += 1
-            close = 0
-            for p in range(count):
-                close += abs(w[p] - w[centre]) <= max_share * w[centre]
-            out_close[v, u] = close if count > 1 else 0
-            if views == 1 and out_close[v, u] == 1:
-                continue
             out_views[v, u] = views
+            if views == 1 and count > 1:
+                near = 0
+                for p in range(count):
+                    near += abs(w[p] - w[centre]) <= max_share * w[centre]
+                if near == 1:
+                    continue
             mean /= total  # from the centre, as small numbers lose nothing when squared
             spread = max(squares / total - mean * mean, 0.0)
             variance = 1.0 / total + spread / max(views - 1, 1)
