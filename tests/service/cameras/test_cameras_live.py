@@ -668,7 +668,7 @@ def test_who_sends_is_waited_for_again(kind: str, monkeypatch: pytest.MonkeyPatc
     source, url, container = (text.format(port=port) for text in LISTENING[kind])
     with pytest.raises(NoSenderError, match="waits for a sender; none came in 1 s"):
         open_camera(source)
-    monkeypatch.setattr(live, "OPEN_S", 10.0)
+    monkeypatch.undo()
     sender = Sender(url, container)
     frames = []
     try:
