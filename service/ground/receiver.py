@@ -45,6 +45,8 @@ ASK_TIMEOUT_S = 120.0
 RETRY_S, LOOK_AROUND_S, LOOK_S = 1.0, 3.0, 0.2
 CHANNEL = 256
 """Messages that may wait in the session, of one kind or to one request."""
+MAX_REQUESTS = 1024
+"""Requests under way, each with a thread, of all drones; each drone may have an equal share."""
 TICK_S, MAX_REST_S = 0.1, 0.5
 """After each turn a drone's worker rests as long as it computed, at most so long: one drone never
 takes more than half of a core."""
@@ -89,6 +91,7 @@ class Drone:
         self._events: list[drone.Event] = []
         self._bytes = 0
         self.dropped = 0
+        self.requests: list[Worker] = []  # take the replies; of its worker alone
 
     def put_head(self, scan: str, payload: bytes) -> None:
         """A head; it takes the place of one of the same scan that waits."""
@@ -238,12 +241,14 @@ class Receiver:
             finally:
                 self._session = None
                 session.close()
-                for taker in self._takers:
+                with self._lock:
+                    takers = self._takers
+                for taker in takers:
                     taker.join()
 
     def _serve(self, session: zenoh.Session, worker: Worker) -> None:
         """Have messages taken until the stop, or until the session ends."""
-        self._takers, ring = [], zenoh.handlers.RingChannel(1)
+        ring = zenoh.handlers.RingChannel(1)
         for key in ("head", "item/*/*"):
             channel = zenoh.handlers.FifoChannel(CHANNEL)
             self._take_from(session.declare_subscriber(f"{ROOT}/*/*/{key}", channel))
@@ -257,7 +262,7 @@ class Receiver:
                     with contextlib.suppress(zenoh.ZError):  # all present drones send their heads
                         session.get(f"{ROOT}/*/*/head", ring, timeout=LOOK_AROUND_S)
 
-    def _take_from(self, source: Any, ended: Callable[[], object] = lambda: None) -> None:
+    def _take_from(self, source: Any, ended: Callable[[], object] = lambda: None) -> Worker:
         """Have a subscriber's samples, or the replies to a request, taken until their end.
 
         A thread of our own: a callback's would belong to the library, and end the process with an
@@ -274,6 +279,7 @@ class Receiver:
         with self._lock:
             taker = self.workers.start("messages", work)
             self._takers = [*(t for t in self._takers if not t.is_done), taker]
+        return taker
 
     def _take(self, key: str, payload: bytes) -> None:
         """Hand on what a drone has sent."""
@@ -381,10 +387,18 @@ class Receiver:
                 self._opened(scan)
 
     def _send(self, one: Drone, effect: drone.Put | drone.Get) -> None:
-        """Put or get; nothing happens while there is no session."""
+        """Put or get; nothing happens while there is no session.
+
+        A request beyond the drone's share is over at once, so that it is made again after a pause.
+        """
         session, drop = self._session, zenoh.CongestionControl.DROP
         if session is None:
             return
+        if isinstance(effect, drone.Get):
+            one.requests = [taker for taker in one.requests if not taker.is_done]
+            if len(one.requests) >= MAX_REQUESTS // max(1, len(self._busy)):
+                one.put(effect.answered)
+                return
         try:
             if isinstance(effect, drone.Put):
                 high = zenoh.Priority.INTERACTIVE_HIGH
@@ -402,7 +416,7 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("%s is not sent: %s", effect.key, error)
             return
-        self._take_from(replies, partial(one.put, effect.answered))
+        one.requests.append(self._take_from(replies, partial(one.put, effect.answered)))
 
     def align(self, folder: Path) -> None:
         """Align a finished scan with those that show the same ground, if configured."""

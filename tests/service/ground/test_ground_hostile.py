@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import shutil
@@ -141,6 +142,32 @@ def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(tmp_p
         assert until(failed)
         assert arrives(tmp_path, endpoint)
         assert not ground.workers.failed
+
+
+def test_a_drone_that_answers_no_request_gets_few_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names ever new scans, for whose headers it is asked."""
+    monkeypatch.setattr("service.ground.receiver.MAX_REQUESTS", 20)
+    kept: list[Any] = []
+    names = itertools.count()
+
+    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+        queryable = session.declare_queryable("skyrelief/evil/**", kept.append)
+
+        def is_full() -> bool:
+            for _ in range(20):
+                session.put(f"skyrelief/evil/scan-{next(names)}/head", head("header", 1, 1))
+            takers = [one for one in ground.workers.report() if one["name"] == "messages"]
+            most.append(len(takers))
+            return next(names) > 2000
+
+        most: list[int] = []
+        assert until(is_full)
+        assert 10 < max(most) <= 2 + 20  # two take what is not asked for
+        assert arrives(tmp_path, endpoint)
+        assert not ground.workers.failed
+        queryable.undeclare()
 
 
 def test_the_files_of_a_drone_whose_worker_has_failed_are_written_at_the_end(
