@@ -47,8 +47,8 @@ Part = tuple[str, int]
 """Name and size in bytes of one uploaded file."""
 MAX_LISTING_BYTES = 4 << 20
 """Size of an archive's table of contents, which is read whole."""
-DONE = re.compile(r"(.*), (\d{1,2}|100) %")
-"""A line of progress, as :func:`service.commands.showing` writes it."""
+DONE = re.compile(r"(.*?)(?:, (\d{1,2}|100) %)?(?:, for \d+ s)?")
+"""A line of progress, as :func:`service.commands.showing` writes it: the step, and what is done."""
 OWN_PATH = re.compile(rf"\S*/{re.escape(TAKING)}[^/\s]+/(?:scan/|uploaded/)?")
 """What an error says about the folder that the upload is in for a while."""
 NAMES = {*STORE_FILES, *FILES, *OTHER_FILES}
@@ -180,9 +180,10 @@ def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
     command += [word for option, path in of.items() for word in (option, str(path))]
 
     def goes_on(line: str) -> bool:
-        said = DONE.fullmatch(line)
-        if said is not None:
-            line, progress.share = said[1], int(said[2]) / 100
+        if said := DONE.fullmatch(line):
+            line, percent = said.groups()
+            if percent is not None:
+                progress.share = int(percent) / 100
         progress((line or "replay")[:80])
         return True
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import http.client
+import io
 import json
 import socket
+import time
 import zipfile
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +18,13 @@ from loopback import until
 from person import Browser
 from portal_client import NEEDS, ONE, TOKEN, Client, browser, client, store
 
+from service.commands import speaking
 from service.errors import InputError, OutsideError
+from service.ground import upload
 from service.ground.guard import MAX_UPLOAD_BYTES
 from service.ground.library import Library
 from service.ground.upload import MAX_LISTING_BYTES, Upload, unpack
+from service.progress import Progress
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -173,6 +180,30 @@ def test_an_upload_fits_the_disk(store: Path) -> None:
     with pytest.raises(OutsideError, match="room for 0 MB"):
         Upload(Library(store), [("scan.db", 2)], room_bytes=1)
     assert nothing_left(store)
+
+
+def test_a_replay_tells_its_step_and_share_also_where_a_line_is_said_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    said, lines, progress = io.StringIO(), list[str](), Progress()
+    with redirect_stderr(said), speaking(quiet_s=0.02) as say:
+        for line in ("replay: reading", "replay: tracking, 35 %"):
+            said.truncate(said.seek(0))
+            say(line)
+            while said.getvalue().count("\n") < 2:
+                time.sleep(0.005)
+            lines.append(said.getvalue().splitlines()[1])
+    seen = []
+
+    def run_to_end(_: str, __: Sequence[str], goes_on: Callable[[str], bool]) -> str:
+        for line in lines:
+            goes_on(line)
+            seen.append((progress.text, progress.share))
+        return ""
+
+    monkeypatch.setattr(upload, "run_to_end", run_to_end)
+    upload._replay([tmp_path / "a.mp4", tmp_path / "a.tlog"], tmp_path / "out", progress)
+    assert seen == [("replay: reading", 0.0), ("replay: tracking", 0.35)]
 
 
 def test_hostile_archives(tmp_path: Path) -> None:
