@@ -244,6 +244,13 @@ def stacked(rows: Sequence[U8]) -> U8:
     return np.vstack([np.pad(one, ((0, 0), (0, wide - one.shape[1]), (0, 0))) for one in rows])
 
 
+def for_documents(tiles: Sequence[U8], edge_rows: Sequence[U8]) -> U8:
+    """One image: the ``tiles``, then the rows of roof edges in two columns."""
+    half = -(-len(edge_rows) // 2)
+    pairs = stacked([np.hstack(edge_rows[n::half]) for n in range(half)])
+    return stacked([*flowed(tiles, pairs.shape[1]), pairs])
+
+
 class Page:
     """Rows of images, each at one pixel to a pixel of the screen."""
 
@@ -325,7 +332,6 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
         row = frame_on_plane(scan.frame, views, grid, height_m) | ours["ortho"] | ours["dsm"]
         found.append(framed(row.values()))
         page.row(row)
-    half = -(-len(found) // 2)
     page.parts.append(f"<h2>{name}: mesh and splats from five sides</h2>")
     utm = np.array([[*chosen[0], low_high_m[0]]])
     target = (utm if scan.frame is None else scan.frame.from_utm(utm))[0]
@@ -335,9 +341,7 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
         page.row(images)
         if side.endswith("the south"):
             tiles += images.values()
-    pairs = np.hstack([stacked(found[:half]), stacked(found[half:] or found[:1])])
-    whole = stacked([*flowed(tiles, pairs.shape[1]), pairs])
-    cv2.imwrite(str(page.out / f"{folder.name}.webp"), whole, WEBP)
+    cv2.imwrite(str(page.out / f"{folder.name}.webp"), for_documents(tiles, found), WEBP)
     page.parts.append(f"<h2>{name}: frames that took no part</h2>")
     video = flight / "flight.mp4"
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from product_sheets import Page, edges, frame_on_plane, from_above, window
+from product_sheets import Page, edges, for_documents, frame_on_plane, from_above, window
 
 from recon.surface.raster import Grid
 from recon.types import F32
@@ -67,3 +67,12 @@ def test_a_page_holds_the_images_of_its_rows(tmp_path: Path) -> None:
 
 def test_without_a_frame_that_holds_an_edge_the_row_says_so() -> None:
     assert list(frame_on_plane(None, [], GRID, 405.0)) == ["not in one frame"]
+
+
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_the_documents_image_shows_each_roof_edge_once(count: int) -> None:
+    rows = [np.full((10, 30, 3), 50 + n, np.uint8) for n in range(count)]
+    image = for_documents([np.full((20, 20, 3), 9, np.uint8)], rows)
+    for n in range(count):
+        assert (image == 50 + n).all(axis=2).sum() == 300
+    assert (image == 9).all(axis=2).sum() == 400
