@@ -4,8 +4,8 @@ Topics: ``/pose`` PoseInFrame, ``/fix`` LocationFix, ``/tf`` FrameTransform, ``/
 PointCloud, ``/image`` CompressedImage, ``/camera`` CameraCalibration, ``/log`` Log. Frame
 ``world`` is ENU metres about the scan's origin. Where the recording is there, ``/frame``
 CompressedImage and ``/frame/camera`` CameraCalibration are the keyframes' frames at full size,
-without distortion. Chunks are 64 KiB and unbuffered, so that a
-process that is killed has written what it logged.
+without distortion. Chunks are 64 KiB and unbuffered, so that a process that is killed has written
+what it logged.
 """
 
 from __future__ import annotations
