@@ -22,7 +22,7 @@ LARGEST_BYTES = 1 << 23
 
 
 LONGEST_HEAD = 4096
-"""Bytes of parameter sets and the like in a packet of their own."""
+"""Bytes of parameter sets and the like in packets of their own."""
 
 START = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 """The start code of a NAL unit, and its first byte."""
@@ -92,13 +92,13 @@ def _headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet
 
     is_picture, head = IS_PICTURE.get(codec), b""
     for packet in packets:
-        if is_picture is not None and packet.size <= LONGEST_HEAD:
+        if is_picture is not None and 0 < packet.size <= LONGEST_HEAD - len(head):
             data = bytes(packet)
             is_started = START.search(data[:5])
             if is_started and not any(is_picture(nal[0]) for nal in START.findall(data)):
                 head += data
                 continue
-        if head:
+        if head and packet.size:  # else no picture follows
             packet, head = _timed(av.Packet(head + bytes(packet)), packet), b""
         yield packet
 

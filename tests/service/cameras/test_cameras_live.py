@@ -26,7 +26,7 @@ import pytest
 from loopback import free_port, until
 
 from service.cameras import CameraFrame, CameraSource, live, open_camera
-from service.cameras.access_units import SURE, access_units
+from service.cameras.access_units import LONGEST_HEAD, SURE, _headed, access_units
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.source import Paced
 from service.cameras.video import decoded_frames, video_stream
@@ -249,6 +249,27 @@ def test_parameter_sets_in_packets_of_their_own_cost_no_key_frame(codec: str, fi
     assert b"".join(unit for unit, _ in units) == b"".join(images[first:])
     assert len(units) == len(images[first:])
     assert [seen for _, seen in units[-3:]] == [len(chunks) - k for k in (2, 1, 0)]  # none waits
+
+
+def test_a_stream_may_end_with_a_packet_without_a_picture() -> None:
+    """It came in place of the empty packet that empties the parser: the last image was lost."""
+    with twenty_images() as (container, images):
+        rest = b"".join(images)
+        chunks = [rest[at : at + 700] for at in range(0, len(rest), 700)]
+        end_of_sequence = b"\0\0\1\x0a"
+        units = [bytes(unit) for unit in cut_out(container, (*chunks, end_of_sequence))]
+    assert units == images
+
+
+def test_packets_without_pictures_are_not_gathered_without_end() -> None:
+    parts = [b"\0\0\1\x06" + bytes([k]) * 1500 for k in range(1, 9)]
+    with twenty_images() as (container, _):
+        packets = [av.Packet(part) for part in parts]
+        for packet in packets:
+            packet.stream, packet.time_base = container.streams.video[0], Fraction(1, 10)
+        passed = [bytes(packet) for packet in _headed(iter(packets), "h264")]
+    assert max(map(len, passed)) <= 2 * LONGEST_HEAD
+    assert b"".join(parts).startswith(b"".join(passed)) and len(passed) == 2
 
 
 @pytest.mark.parametrize("container", ["mpegts", "h264", "matroska"])
