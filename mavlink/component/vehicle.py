@@ -37,7 +37,7 @@ from mavlink.wire.framing import Packet
 from mavlink.wire.link import Job, Link, LinkInbox, parse_link
 from mavlink.wire.messages import LinkReport, Links, OutgoingMessage
 from mavlink.wire.signing import UNIT_PER_S, Signing, fingerprint, read_key
-from mavlink.wire.stand_in import NICE, StandIn
+from mavlink.wire.stand_in import AFTER_S, NICE, StandIn
 from mavlink.wire.tlog import TlogRecorder
 
 log = logging.getLogger(__name__)
@@ -134,7 +134,9 @@ class VehicleLink:
         self._links = Links(opened, self._on_packet, self.signing, sequence)
 
     def _make_signing(self, key: bytes) -> Signing:
-        ours = self._memory.signing_timestamp + UNIT_PER_S  # a crash forgets what was sent last
+        # A crash forgets what was sent in the last second, and by the stand-in after it.
+        forgotten = round((1.0 + AFTER_S[-1]) * UNIT_PER_S)
+        ours = self._memory.signing_timestamp + forgotten
         return Signing(key, ours, self._memory.signing_streams)
 
     # Called by the service.
@@ -324,7 +326,7 @@ class VehicleLink:
             self._links.skip(stand_in.sent())
         self._record(self._links.send(system, beats), now_ns)
         if beats and stand_in is not None:
-            stand_in.plan(self._links.ahead(system, beats, time.monotonic()))
+            stand_in.plan(self._links.ahead(system, beats, time.monotonic()), self._links.ways)
 
     def _send(self, messages: list[OutgoingMessage]) -> None:
         if messages:

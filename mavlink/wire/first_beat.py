@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mavlink.wire.link import Link, parse_link
-from mavlink.wire.stand_in import AFTER_S, Beat, StandIn
+from mavlink.wire.stand_in import AFTER_S, Beat, StandIn, Way
 
 ONBOARD = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 CAMERA = 100  # MAV_COMP_ID_CAMERA
@@ -95,7 +95,7 @@ class FirstBeats:
                     link.write(packet)
             self.sequence = (self.sequence + 1) & 0xFF
             if self.stand_in is not None:
-                self.stand_in.plan(self._ahead(time.monotonic()))
+                self.stand_in.plan(self._ahead(time.monotonic()), self._ways)
             self.next_s = max(self.next_s + PERIOD_S, time.monotonic())
             self._stop.wait(max(0.0, self.next_s - time.monotonic()))
 
@@ -107,8 +107,11 @@ class FirstBeats:
         ]
 
     def _ahead(self, now_s: float) -> list[Beat]:
-        ways = [way for link in self.links for way in link.ways]
+        ways = self._ways()
         return [
             (now_s + after_s, [(way, packet) for way in ways for packet in self._packets(ahead)])
             for ahead, after_s in enumerate(AFTER_S)
         ]
+
+    def _ways(self) -> list[Way]:
+        return [way for link in self.links for way in link.ways]

@@ -16,7 +16,7 @@ from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer, Packet
 from mavlink.wire.link import Link
 from mavlink.wire.signing import Signing
-from mavlink.wire.stand_in import AFTER_S, Beat
+from mavlink.wire.stand_in import AFTER_S, Beat, Way
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class Packer:
                 encoder = self._encoders[key] = dialect.MAVLink(None, *key)
                 encoder.seq = self._sequence
             if self._signing is not None:
-                self._signing.prepare(encoder, self._link, unix_ns, ahead is not None)
+                self._signing.prepare(encoder, self._link, unix_ns, ahead)
             sequence = encoder.seq
             encoder.seq = (sequence + (ahead or 0)) % 256
             try:
@@ -94,7 +94,10 @@ class Packer:
 
     def skip(self, packets: int) -> None:
         """Another process has sent so many packets of each component."""
+        if self._signing is not None:
+            self._signing.skip(packets)
         with self._lock:
+            self._sequence = (self._sequence + packets) % 256
             for encoder in self._encoders.values():
                 encoder.seq = (encoder.seq + packets) % 256
 
@@ -203,6 +206,10 @@ class Links:
             ]
             beats.append((now_s + after_s, sent))
         return beats
+
+    def ways(self) -> list[Way]:
+        """To everyone on all links, for another process."""
+        return [way for link in self._links for way in link.ways]
 
     def skip(self, packets: int) -> None:
         """Another process has sent so many packets of each component on each link."""

@@ -73,15 +73,22 @@ class Signing:
         with self._lock:
             return dict(self._streams)
 
-    def prepare(self, encoder: Any, link: int, unix_ns: int, is_ahead: bool = False) -> None:
+    def prepare(self, encoder: Any, link: int, unix_ns: int, ahead: int | None = None) -> None:
         """Let an encoder of pymavlink sign its next packet; times increase strictly even when the
-        clock steps back. One ``is_ahead`` may never be sent, and others are sent before."""
+        clock steps back. One that is packed ``ahead``, as after so many others, may never be sent:
+        :meth:`skip` counts those that were."""
         with self._lock:
-            timestamp = min(LARGEST, max(self.timestamp + 1, timestamp_of(unix_ns)))
-            self.timestamp = self.timestamp if is_ahead else timestamp
+            least = self.timestamp + 1 + (ahead or 0)
+            timestamp = min(LARGEST, max(least, timestamp_of(unix_ns)))
+            self.timestamp = timestamp if ahead is None else self.timestamp
             encoder.signing.timestamp = timestamp
         encoder.signing.secret_key, encoder.signing.link_id = self._key, link & 0xFF
         encoder.signing.sign_outgoing = True
+
+    def skip(self, packets: int) -> None:
+        """So many packets of each stream that were packed ahead have been sent."""
+        with self._lock:
+            self.timestamp = min(LARGEST, self.timestamp + packets)
 
     def accepts(self, packet: Packet) -> bool:
         with self._lock:

@@ -16,7 +16,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 Way = tuple[int, tuple[str, int] | None]
 """A port's descriptor, and the address of a datagram."""
@@ -27,33 +27,56 @@ AFTER_S = (1.05, 2.05, 3.05)
 """After a heartbeat of ours, those of the other process are due so late."""
 NICE = -10  # needs LimitNICE or root, otherwise the priority stays normal; real time needs more
 MAX_BYTES, MAX_PORTS = 1 << 16, 64
+CLOSE_S = 2.0
 
 
 class StandIn:
-    """The process, until :meth:`close`. Use from one thread."""
+    """The process, until :meth:`close`. Use from one thread.
+
+    Where it cannot start, or ends, heartbeats are ours alone, and the log says so.
+    """
 
     def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
         self._channel, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._channel.setblocking(False)
         with other:
-            self._process = subprocess.Popen(
-                [sys.executable, "-IS", __file__, str(other.fileno())],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                pass_fds=[other.fileno()],
-                start_new_session=True,
-            )
+            try:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-IS", __file__, str(other.fileno())],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    pass_fds=[other.fileno()],
+                    start_new_session=True,
+                )
+            except OSError as error:
+                _warn(f"does not start: {error}")
 
-    def plan(self, beats: Sequence[Beat]) -> None:
-        """Have these sent, in place of those planned before."""
-        ports = sorted({way[0] for _, sent in beats for way, _ in sent if way[0] >= 0})
-        places = {port: place for place, port in enumerate(ports[:MAX_PORTS])}
-        text = marshal.dumps([
-            (due_s, [(places[port], to, data) for (port, to), data in sent if port in places])
-            for due_s, sent in beats
-        ])  # fmt: skip
-        with contextlib.suppress(OSError):  # it has ended, or a port was closed meanwhile
-            socket.send_fds(self._channel, [text], ports[:MAX_PORTS])
+    def plan(self, beats: Sequence[Beat], ways: Callable[[], Sequence[Way]]) -> None:
+        """Have these sent, in place of those planned before, on those of their ways that ``ways``
+        still gives: the number of a port that was closed may be another file's by now."""
+        copies: dict[int, int] = {}  # of ports: they stay what they are
+        with contextlib.ExitStack() as held:
+            for port in sorted({way[0] for _, sent in beats for way, _ in sent})[:MAX_PORTS]:
+                with contextlib.suppress(OSError):  # it was closed
+                    copies[port] = os.dup(port)
+                    held.callback(os.close, copies[port])
+            ports = [port for port, _ in ways() if port in copies]
+            places = {port: place for place, port in enumerate(dict.fromkeys(ports))}
+            text = marshal.dumps([
+                (due_s, [(places[port], to, data) for (port, to), data in sent if port in places])
+                for due_s, sent in beats
+            ])  # fmt: skip
+            try:
+                socket.send_fds(self._channel, [text], [copies[port] for port in places])
+            except OSError:
+                self._look()
+
+    def _look(self) -> None:
+        """Say it once where the process has ended."""
+        if self._process is not None and self._process.poll() is not None:
+            _warn(f"has ended with {self._process.returncode}")
+            self._process = None
 
     def sent(self) -> int:
         """How many heartbeats it has sent since the last call."""
@@ -65,7 +88,20 @@ class StandIn:
 
     def close(self) -> None:
         self._channel.close()
-        self._process.wait()
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(CLOSE_S)
+        process.kill()  # one that a port or a debugger holds; without effect on one that has ended
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(CLOSE_S)
+
+
+def _warn(text: str) -> None:
+    import logging  # the process itself needs none
+
+    logging.getLogger(__name__).warning("the process for heartbeats that are late %s", text)
 
 
 def serve(channel: socket.socket) -> None:
@@ -75,7 +111,10 @@ def serve(channel: socket.socket) -> None:
     while True:
         wait_s = max(0.0, beats[0][0] - time.monotonic()) if beats else None
         if select.select([channel], [], [], wait_s)[0]:
-            text, received, _, _ = socket.recv_fds(channel, MAX_BYTES, MAX_PORTS)
+            try:
+                text, received, _, _ = socket.recv_fds(channel, MAX_BYTES, MAX_PORTS)
+            except ConnectionResetError:  # it closed before it read all that we sent
+                return
             for port in ports:
                 os.close(port)
             if not text:
