@@ -79,11 +79,12 @@ def read_geo(path: Path) -> dict[str, GeoTag]:
 
 
 def _cells(row: str) -> list[str]:
-    """The columns of a row, at least one."""
+    """The columns of a row, at least one; a name may have spaces, semicolons or commas."""
     spaced = row.split() or [""]
     for mark in ";,":
-        if mark in spaced[0] or (mark in row and len(spaced) < PLACE):
-            return [cell.strip() for cell in row.split(mark)]
+        cells = [cell.strip() for cell in row.split(mark)]
+        if (mark in spaced[0] or len(spaced) < PLACE) and len(_numbers(cells[1:])) >= 2:
+            return cells
     return spaced
 
 

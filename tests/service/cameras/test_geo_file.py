@@ -75,6 +75,12 @@ def test_what_separates_columns_and_decimals(tmp_path: Path, rows: str) -> None:
     assert (b.lat_deg, b.alt_amsl_m, b.is_sigma_h_stated) == (47.3, None, False)
 
 
+@pytest.mark.parametrize("name", ["a,1.jpg", "a;b,2.jpg", "a,1,2.jpg"])
+def test_a_name_may_have_what_separates_columns(tmp_path: Path, name: str) -> None:
+    found = read_geo(write(tmp_path / "geo.txt", "EPSG:4326", f"{name} 8.5 47.3 412.5"))
+    assert list(found) == [name] and found[name].alt_amsl_m == 412.5
+
+
 @pytest.mark.parametrize(("code", "foot_m"), [(6360, 1200 / 3937), (8228, 0.3048)])
 def test_heights_in_feet_are_converted(tmp_path: Path, code: int, foot_m: float) -> None:
     """State plane coordinates, which ODM's own tests have (EPSG:2251): feet up as well."""
