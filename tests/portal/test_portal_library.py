@@ -198,6 +198,10 @@ def test_an_upload_is_seen_at_work_and_then_on_the_card_of_its_scan(
         browser.page.route("**/api/upload*", lambda route: route.fulfill(status=202, json=job))
         browser.page.route("**/api/jobs", lambda route: route.fulfill(json=[job]))
         browser.page.click("summary:text('Add scans')")
+        browser.page.click(".import input[size]")
+        for letter in "flight":
+            browser.key(letter)
+        assert browser.page.input_value(".import input[size]") == "flight"
         browser.key("Escape")
         assert not browser.run(f"{menu}.open")
         browser.page.click("summary:text('Add scans')")

@@ -168,7 +168,12 @@ function importForm(again: () => void, upload: (files: FileList | null) => void)
   });
   const menu = el("div", { className: "settings" }, el("p", {}, folder, act), el("p", {}, send, "or drop files on this page"), chosen);
   const summary = el("summary", { textContent: "Add scans" });
-  box.onkeydown = ({ key }) => key === "Escape" && box.open && (close(), summary.focus());
+  // Not onkeydown: what that returns, false for a letter, keeps the letter from the field.
+  box.addEventListener("keydown", ({ key }) => {
+    if (key !== "Escape" || !box.open) return;
+    close();
+    summary.focus();
+  });
   box.append(summary, menu);
   return box;
 }
