@@ -33,7 +33,6 @@ from recon.stereo.reprojection import (
     LABEL_SIGMA_PX,
     MAX_NOISE,
     MIN_COMMON,
-    MIN_NOISE,
     NOISE_STRIDE,
     PAIRS_CORRELATION,
     DepthFusionConfig,
@@ -132,9 +131,9 @@ def fused_pairs(
     """As :func:`recon.stereo.reprojection.fuse` of pairs (P, h, w), with the noise they show."""
     noise = label_noise(depth, sigma)
     is_refuted = ~(fuse(depth, sigma, config)[2] > 0).any()
-    out, error, views = fuse(depth, sigma * noise.clamp(min=1.0), config)
+    out, error, views = fuse(depth, sigma * noise, config)
     out, error = (torch.where(is_refuted, torch.nan, a) for a in (out, error))
-    return out, error * noise.clamp(max=1.0), torch.where(is_refuted, 0, views)
+    return out, error, torch.where(is_refuted, 0, views)
 
 
 def label_noise(depth: Tensor, sigma: Tensor) -> Tensor:
@@ -153,7 +152,7 @@ def label_noise(depth: Tensor, sigma: Tensor) -> Tensor:
         squares = squares + torch.where(enough, middle * middle, 0.0)
         known = known + enough
     noise = (squares / known.clamp(min=1) / (1.0 - PAIRS_CORRELATION)).sqrt()
-    return torch.where(known > 0, noise.clamp(MIN_NOISE, MAX_NOISE), 1.0)
+    return torch.where(known > 0, noise.clamp(1.0, MAX_NOISE), 1.0)
 
 
 def device_inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:

@@ -212,16 +212,18 @@ PAIRS_CORRELATION = 0.15
 """Correlation of the errors of two pairs of a view: they share its image. Measured on simulated
 flights at crf 18 and 32 (docs/reports/simulated-flights.md)."""
 
-MIN_NOISE, MAX_NOISE = 0.5, 8.0
-"""Noise of labels over the usual one: with less, pairs share errors; with more, nothing matches."""
+MAX_NOISE = 8.0
+"""Noise of labels over the usual one, at most: with more, nothing matches."""
 
 
 def label_noise(pairs: Sequence[PairDepth]) -> float | None:
-    """Sigma of labels over the usual one, as the pairs of one view show; None where too few do.
+    """Sigma of labels over the usual one, 1 to 8, as the pairs of one view show; None where too few
+    do.
 
     It is the square root of the variance factor (Mikhail and Ackermann, Observations and Least
-    Squares, 1976): how far pairs disagree over what their sigmas let expect. Clear images match
-    better than usual, and what an encoder smears or drops matches several times worse.
+    Squares, 1976): how far pairs disagree over what their sigmas let expect. What an encoder smears
+    or drops matches several times worse than usual. Pairs of clear images disagree less, but what
+    is wrong in all of them, as the view's pose, keeps the usual sigma right.
     """
     inverse = [1.0 / pair.depth_m[::NOISE_STRIDE, ::NOISE_STRIDE] for pair in pairs]
     sigma = [
@@ -237,7 +239,7 @@ def label_noise(pairs: Sequence[PairDepth]) -> float | None:
     if not squares:
         return None
     noise = np.sqrt(np.mean(squares) / (1.0 - PAIRS_CORRELATION))
-    return float(np.clip(noise, MIN_NOISE, MAX_NOISE))
+    return float(np.clip(noise, 1.0, MAX_NOISE))
 
 
 def fuse(
@@ -250,19 +252,17 @@ def fuse(
     """One depth map of all pairs: at each pixel the largest group that agrees, averaged.
 
     The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2; the
-    sigma is the larger of the propagated one and the spread inside the group. ``noise`` multiplies
-    all sigmas; less than 1 only those of the result, as clear images err seldom and then far: pairs
-    that a narrower gate leaves out are good ones. ``views`` counts the group. Where several pairs
-    read and none comes within ``max_sigma_share`` of another nothing is known. Where that is so at
-    more pixels than those at which two agree within usual sigmas, what they see is not a rigid
-    surface, or their motion is false, which no noise excuses, and the whole map is unknown.
+    sigma is the larger of the propagated one and the spread inside the group. ``noise``, at least
+    1, multiplies all sigmas. ``views`` counts the group. Where several pairs read and none comes
+    within ``max_sigma_share`` of another nothing is known. Where that is so at more pixels than
+    those at which two agree within usual sigmas, what they see is not a rigid surface, or their
+    motion is false, which no noise excuses, and the whole map is unknown.
     """
     depth = np.stack([p.depth_m for p in pairs])
     sigma = np.stack([p.sigma_m for p in pairs])
     out = _fused(depth, sigma, K, T_world_camera, config)
     if noise > 1.0 and out.views.any():
         out = _fused(depth, np.float32(noise) * sigma, K, T_world_camera, config)
-    out.sigma_m[:] *= np.float32(min(noise, 1.0))
     return out
 
 

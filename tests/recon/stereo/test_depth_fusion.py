@@ -106,7 +106,7 @@ def test_useless_readings_are_left_out() -> None:
     assert np.isnan(fused.depth_m).all()
 
 
-@pytest.mark.parametrize("times", [0.7, 1.0, 3.0])
+@pytest.mark.parametrize("times", [1.1, 2.0, 3.0])
 def test_noise_of_labels_is_how_far_pairs_of_a_view_disagree(times: float) -> None:
     """Pairs that err by ``times`` their sigmas, a part of it alike, as they share the view."""
     rng = np.random.default_rng(5)
@@ -131,6 +131,16 @@ def test_noise_of_labels_is_how_far_pairs_of_a_view_disagree(times: float) -> No
     assert np.mean(fused.views[20:, 100:] == 4) > 0.9  # right sigmas: none is left out
 
 
+def test_pairs_that_agree_better_than_usual_are_no_surer() -> None:
+    """What is wrong in all of them does not show."""
+    noise = np.random.default_rng(5).normal(0.0, 0.03, (4, 180, 320))
+    pairs = [
+        PairDepth((50.0 + error).astype(np.float32), np.full((180, 320), 0.1, np.float32))
+        for error in noise
+    ]
+    assert label_noise(pairs) == 1.0
+
+
 @pytest.mark.parametrize(("scatter", "is_kept"), [(0.02, True), (0.035, True), (0.12, False)])
 def test_no_sigma_makes_a_surface_of_a_false_motion(scatter: float, is_kept: bool) -> None:
     """Pairs whose depths scatter by a share of them, where 0.5 % is stated."""
@@ -144,9 +154,12 @@ def test_no_sigma_makes_a_surface_of_a_false_motion(scatter: float, is_kept: boo
     assert bool(fused.views.any()) == is_kept
 
 
-@pytest.mark.parametrize("quality", [95, 15, 5])
-def test_sigma_holds_however_much_the_images_are_compressed(quality: int) -> None:
-    """A tilted camera over painted ground, by four partners whose poses are exact."""
+@pytest.mark.parametrize(("quality", "most"), [(95, 0.95), (15, 0.9), (5, 0.85)])
+def test_sigma_holds_however_much_the_images_are_compressed(quality: int, most: float) -> None:
+    """The usual sigma also holds what is wrong in all pairs, here nothing: clear images do better.
+
+    A tilted camera over painted ground, by four partners whose poses are exact.
+    """
     images = []
     for seq, east_m in enumerate((0.0, 4.0, -4.0, 8.0, -8.0)):
         T = pose(east_m, seed=seq)
@@ -165,5 +178,5 @@ def test_sigma_holds_however_much_the_images_are_compressed(quality: int) -> Non
     known = np.isfinite(depth.depth_m)
     off = np.abs(depth.depth_m - truth)[known]
     assert known.mean() > 0.9
-    assert 0.7 < np.mean(off <= depth.sigma_m[known]) < 0.85
+    assert 0.7 < np.mean(off <= depth.sigma_m[known]) < most
     assert np.mean(off <= 2 * depth.sigma_m[known]) > 0.94
