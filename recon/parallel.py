@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from functools import cache
 from itertools import pairwise
 from threading import Event
 from typing import Any, TypeVar
 
 from numba import config
-
-from recon.compiled import keep_packed
 
 T = TypeVar("T")
 
@@ -26,7 +25,10 @@ RELEASE_S = 1e-4
 CELLS_PER_THREAD = 1 << 20
 """Cells of a cost volume that are worth a thread: half a millisecond of simple work."""
 
-keep_packed()  # before the first kernel is loaded
+with suppress(ImportError):  # numba's own names, which another version need not have
+    from recon.compiled import keep_packed
+
+    keep_packed()  # before the first kernel is loaded
 
 _limit = 0  # threads that one call may use; 0: one per core
 
