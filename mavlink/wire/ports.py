@@ -9,6 +9,7 @@ for NMEA 0183 or CSV on UDP (:mod:`mavlink.wire.lines`).
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import select
 import socket
 import termios
@@ -106,6 +107,8 @@ class SerialPort:
         return [(self._line.fileno(), None)]
 
     def close(self) -> None:
+        with contextlib.suppress(OSError):  # a stand-in may hold the line, and its lock, for longer
+            fcntl.flock(self._line.fileno(), fcntl.LOCK_UN)
         self._line.close()
 
 
@@ -219,11 +222,20 @@ class TcpPort:
             raise error
         with contextlib.suppress(ValueError):
             self._peers.remove(peer)
-        peer.close()
+        _end(peer)
 
     def close(self) -> None:
-        for one in [*self._peers, *self._servers]:
-            one.close()
+        for peer in self._peers:
+            _end(peer)
+        for server in self._servers:
+            server.close()
+
+
+def _end(peer: socket.socket) -> None:
+    """Close a connection at both ends, although a stand-in may hold it for longer."""
+    with contextlib.suppress(OSError):
+        peer.shutdown(socket.SHUT_RDWR)
+    peer.close()
 
 
 def _ready(sockets: Sequence[socket.socket]) -> list[socket.socket]:

@@ -115,8 +115,7 @@ def serve(channel: socket.socket) -> None:
                 text, received, _, _ = socket.recv_fds(channel, MAX_BYTES, MAX_PORTS)
             except ConnectionResetError:  # it closed before it read all that we sent
                 return
-            for port in ports:
-                os.close(port)
+            _close(ports)
             if not text:
                 return
             beats, ports = marshal.loads(text), received
@@ -126,6 +125,13 @@ def serve(channel: socket.socket) -> None:
                 _send(ports[place], to, data)
         with contextlib.suppress(OSError):
             channel.send(b"1")
+        if not beats:  # nothing holds a port for a service that is silent
+            _close(ports)
+
+
+def _close(ports: list[int]) -> None:
+    while ports:
+        os.close(ports.pop())
 
 
 def _send(port: int, to: tuple[str, int] | None, data: bytes) -> None:

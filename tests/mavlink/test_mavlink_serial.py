@@ -14,6 +14,7 @@ from rehearsal import RehearsalVehicle
 
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
+from mavlink.wire.ports import SerialPort, parse_link
 
 
 def plug(path: Path) -> int:
@@ -55,6 +56,20 @@ def test_a_serial_line_is_spoken_to_first_and_survives_the_plug(tmp_path: Path) 
         framer = Framer()
         until(lambda: 77 in heard(line, framer))
     os.close(line)
+
+
+def test_a_line_that_a_stand_in_still_holds_opens_again_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "autopilot"
+    line, spec = plug(path), parse_link(f"serial:{path}:57600")
+    port = SerialPort(spec)
+    ((number, _),) = port.ways
+    held = os.dup(number)
+    with pytest.raises(OSError, match="lock"):
+        SerialPort(spec)
+    port.close()
+    SerialPort(spec).close()
+    for descriptor in (held, line):
+        os.close(descriptor)
 
 
 def test_a_line_that_is_unplugged_while_it_opens_is_opened_again(

@@ -101,6 +101,19 @@ def test_the_newest_peers_of_a_port_are_answered() -> None:
             assert peer.recv(16) == b"y"
 
 
+def test_a_connection_that_a_stand_in_still_holds_ends_for_the_other_end_too() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = TcpPort(LinkSpec("tcp", "127.0.0.1", server.getsockname()[1]))
+        peer, _ = server.accept()
+        with peer:
+            ((number, _),) = port.ways
+            held = os.dup(number)
+            port.close()
+            peer.settimeout(20.0)
+            assert peer.recv(1) == b""
+            os.close(held)
+
+
 def test_a_client_that_is_dropped_while_others_are_read_ends_nothing() -> None:
     at = LinkSpec("tcpin", "127.0.0.1", free_port(socket.SOCK_STREAM))
     with (
