@@ -251,7 +251,7 @@ class Receiver:
         ring = zenoh.handlers.RingChannel(1)
         for key in ("head", "item/*/*"):
             channel = zenoh.handlers.FifoChannel(CHANNEL)
-            self._take_from(session.declare_subscriber(f"{ROOT}/*/*/{key}", channel))
+            self._take_from(key, session.declare_subscriber(f"{ROOT}/*/*/{key}", channel))
         look_at = 0.0
         while not (worker.stop.wait(LOOK_S) or session.is_closed()):
             worker.beat()
@@ -262,8 +262,13 @@ class Receiver:
                     with contextlib.suppress(zenoh.ZError):  # all present drones send their heads
                         session.get(f"{ROOT}/*/*/head", ring, timeout=LOOK_AROUND_S)
 
-    def _take_from(self, source: Any, ended: Callable[[], object] = lambda: None) -> Worker:
+    def _take_from(
+        self, name: str, source: Any, ended: Callable[[], object] = lambda: None
+    ) -> Worker:
         """Have a subscriber's samples, or the replies to a request, taken until their end.
+
+        A worker that starts takes the place of a failed one of its name, so a subscriber's has a
+        ``name`` of its own.
 
         A thread of our own: a callback's would belong to the library, and end the process with an
         abort when it outlives the interpreter.
@@ -277,7 +282,7 @@ class Receiver:
             ended()
 
         with self._lock:
-            taker = self.workers.start("messages", work)
+            taker = self.workers.start(f"messages {name}", work)
             self._takers = [*(t for t in self._takers if not t.is_done), taker]
         return taker
 
@@ -416,7 +421,8 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("%s is not sent: %s", effect.key, error)
             return
-        one.requests.append(self._take_from(replies, partial(one.put, effect.answered)))
+        answered = partial(one.put, effect.answered)
+        one.requests.append(self._take_from("replies", replies, answered))
 
     def align(self, folder: Path) -> None:
         """Align a finished scan with those that show the same ground, if configured."""

@@ -158,8 +158,8 @@ def test_a_drone_that_answers_no_request_gets_few_threads(
         def is_full() -> bool:
             for _ in range(20):
                 session.put(f"skyrelief/evil/scan-{next(names)}/head", head("header", 1, 1))
-            takers = [one for one in ground.workers.report() if one["name"] == "messages"]
-            most.append(len(takers))
+            names_now = [one["name"] for one in ground.workers.report()]
+            most.append(sum(name.startswith("messages ") for name in names_now))
             return next(names) > 2000
 
         most: list[int] = []
@@ -167,6 +167,34 @@ def test_a_drone_that_answers_no_request_gets_few_threads(
         assert 10 < max(most) <= 2 + 20  # two take what is not asked for
         assert arrives(tmp_path, endpoint)
         assert not ground.workers.failed
+        queryable.undeclare()
+
+
+def test_what_takes_items_no_more_is_told_whatever_is_asked_afterwards(tmp_path: Path) -> None:
+    with (
+        serving(tmp_path, workers=Workers(max_restarts=0)) as (ground, endpoint),
+        hostile(endpoint) as session,
+    ):
+        assert until(lambda: _introduced(ground, session, "red", "scan-1"))
+        take = ground._take
+
+        def fails(key: str, payload: bytes) -> None:
+            if "/item/" in key:
+                raise KeyError("made up")
+            take(key, payload)
+
+        ground._take = fails  # type: ignore[method-assign]
+
+        def failed() -> bool:
+            introduce(session, "red", "scan-1")
+            return bool(ground.workers.failed)
+
+        assert until(failed)
+        asked: list[Any] = []
+        queryable = session.declare_queryable("skyrelief/red/**", asked.append)
+        session.put("skyrelief/red/scan-2/head", head("header", 1, 1))
+        assert until(lambda: asked)
+        assert [worker.name for worker in ground.workers.failed] == ["messages item/*/*"]
         queryable.undeclare()
 
 
