@@ -25,7 +25,7 @@ CANDIDATES = 6
 """Views kept per triangle, the finest."""
 
 MIN_COSINE = 0.1
-"""A flatter view of a triangle is not used."""
+"""A flatter view of the surface around a triangle is not used."""
 
 EDGE_PX = 1.0
 OUTLIER_LEVELS = 25.0
@@ -104,7 +104,10 @@ def look(
 
 
 OWN_WEIGHT = 3.0
+"""Of a triangle's own normal, as much as three neighbours of its size have together."""
+
 EQUILATERAL = 0.25 * 3.0**0.5
+"""Area of an equilateral triangle whose edge is 1."""
 
 
 def steady_normals(corners: F64, neighbours: I32) -> tuple[F64, F64]:
