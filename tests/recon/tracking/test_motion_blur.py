@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import cv2
 import numpy as np
 import painted_ground as painted
@@ -18,6 +20,7 @@ from recon.tracking.motion_blur import ExposureWatch, streak_px
 from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Camera, PosePrior, StereoPair
 from service.flight.reports import motion_blur, slow_shutter
+from service.flight.scan import Scan, ScanInputs
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 360))
@@ -96,7 +99,7 @@ def pose(t_s: float) -> F64:
 
 
 @pytest.mark.slow
-def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
+def test_a_shutter_too_slow_for_the_speed_is_seen_in_the_images() -> None:
     ground, exposure_s = painted_ground(), 0.05
     odometry = Odometry(CAMERA)
     assert motion_blur(odometry.exposure, 2.0) is None
@@ -112,6 +115,16 @@ def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
     assert blur is not None and blur["exposure_ms"] == pytest.approx(50.0, rel=0.3)
     assert blur["blur_px"] > 10.0, "px of the recording, twice as fine"
     assert f"images by {blur['blur_px']:.0f} px" in slow_shutter(blur)
+
+
+def test_the_operator_hears_once_that_the_shutter_is_too_slow() -> None:
+    warnings = list[str]()
+    scan = Mock(Scan, inputs=Mock(ScanInputs, warn=warnings.append), _is_blur_reported=False)
+    for blur_px in (None, 9.4, 12.1):
+        scan.motion_blur = blur_px and {"blur_px": blur_px, "exposure_ms": 20.0}
+        Scan._report_blur(scan)
+    assert warnings == ["Shutter too slow: images blur by 9 px"]
+    assert len(warnings[0]) <= 50, "characters that a ground station shows"
 
 
 def shot(T_world_camera: F64, blur_px: F64) -> U8:
