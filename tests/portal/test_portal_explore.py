@@ -417,21 +417,30 @@ class HighFlight(HouseFlight):
     height_m = 120.0
 
 
-def test_a_view_that_follows_looks_at_the_ground_below_the_aircraft(
-    browser: Browser, tmp_path: Path
+def test_a_view_that_follows_looks_at_the_ground_below_the_aircraft_also_after_a_climb(
+    browser: Browser, tmp_path: Path, house: HouseFlight
 ) -> None:
+    high = HighFlight()
     portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
-    with HighFlight().flown(tmp_path / "drone-1/test-1") as store:
+    with house.flown(tmp_path / "drone-1/test-1") as store:
         portal.start()
         browser.open("about:blank")
         browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
         browser.wait("document.body.dataset.points > 71000")
-        store.add_pose(HighFlight().record(5, 25.0))
-        browser.wait("document.querySelector('.figures').textContent.includes('25 m')")
-        settle(browser)
-        east, north, up = view(browser)[3:]
-        assert east == pytest.approx(25.0, abs=0.5) and abs(north) < 0.5
-        assert abs(up) < 8.0  # the house is 6 m high
+        for flight, seq in ((house, 5), (high, 8)):
+            east_m = 5.0 * seq
+            if flight is high:
+                for k in (5, 6, 7):
+                    one = high.keyframe(k, 5.0 * k)
+                    store.add_keyframe(k, encode(one, one.time_ns))
+                browser.wait("document.body.dataset.points > 114000")
+            store.add_pose(flight.record(seq, east_m))
+            said = f"'{east_m:.0f} m'"
+            browser.wait(f"document.querySelector('.figures').textContent.includes({said})")
+            settle(browser)
+            east, north, up = view(browser)[3:]
+            assert east == pytest.approx(east_m, abs=0.5) and abs(north) < 0.5
+            assert abs(up) < 8.0  # the house is 6 m high
         browser.open("about:blank")
     portal.close()
 

@@ -28,6 +28,7 @@ const SHARP_PX = 1.3; // of the screen, between two vertices of a surface
 const BUILD_MS = [25, 60] as const; // for finer surfaces, a frame while the view moves, and at rest
 const GROUND_SAMPLES = 400_000; // of the heightfield below
 const GROUND_MS = 1500; // between two of them
+const NEWEST = 5; // keyframes that tell how far the camera looks
 const MAX_TRIANGLES = 12_000_000; // in memory
 
 /** GLSL: the colour that a place is shown in; linear, as `rgb`. */
@@ -214,8 +215,7 @@ export class Cloud implements Gradual {
     this.place(chunk.seq, held);
     this.groupOf(chunk.seq).add(object, surface.mesh);
     this.expose(held, 1);
-    const depths = [...this.chunks.values()].filter(({ surface }) => surface.triangles).map(({ surface, scale }) => surface.depth * scale).sort((a, b) => a - b);
-    this.shared.behind.value = BEHIND * (depths[depths.length >> 1] ?? 0);
+    this.shared.behind.value = BEHIND * middleDepth([...this.chunks.values()]);
     this.show(chunk.seq, held);
   }
 
@@ -245,9 +245,10 @@ export class Cloud implements Gradual {
     return this.kind === "points" || this.showsFigures ? 1 : PHOTOGRAPHED;
   }
 
-  /** How far the cameras look, m: the median of their depths; 0 without any. */
+  /** How far the camera looks by now, m: as the newest keyframes do, since it climbs and sinks; 0 without any. */
   get reach(): number {
-    return this.shared.behind.value / BEHIND;
+    const own = [...this.chunks].filter(([seq]) => seq < STRIDE).map(([, held]) => held);
+    return middleDepth(own.sort((a, b) => b.time - a.time).slice(0, NEWEST));
   }
 
   /** Metres by which what is not measured is drawn behind. */
@@ -563,6 +564,12 @@ export class Cloud implements Gradual {
     this.chunks.delete(seq);
     this.expose(held, -1);
   }
+}
+
+/** The median of the depths of surfaces, m; 0 without any. */
+function middleDepth(held: Held[]): number {
+  const depths = held.filter(({ surface }) => surface.triangles).map(({ surface, scale }) => surface.depth * scale).sort((a, b) => a - b);
+  return depths[depths.length >> 1] ?? 0;
 }
 
 /** Triangles of surfaces that are drawn this many levels coarser than sharp. */
