@@ -188,8 +188,11 @@ class Segments:
         """Place a segment by a loop, for good."""
         segment = self._all[number]
         placed, before = Alignment(scale, R, t), segment.similarity
-        if before is not None:
-            placed = replace(placed, covariance=before.covariance, sources=before.sources)
+        if before is not None:  # mount and drift are not of the place
+            placed = replace(
+                placed, covariance=before.covariance, sources=before.sources,
+                mount_rad=before.mount_rad, drift_m=before.drift_m, span_s=before.span_s,
+            )  # fmt: skip
         known = (found for _, found in self._placed() if found.sigma_fixes is not None)
         other = next(known, placed)  # one receiver places all that loops join
         placed = replace(placed, sigma_fixes=other.sigma_fixes, sigma_counted=other.sigma_counted)

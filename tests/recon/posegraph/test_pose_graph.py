@@ -550,9 +550,12 @@ def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:
     assert graph.scale(20) == pytest.approx(0.5 * graph.scale(4), rel=0.03)
 
 
-def tied_stretch(compass_rad: float, tilt_rad: float = 0.0) -> F64:
+def tied_stretch(
+    compass_rad: float, tilt_rad: float = 0.0, mount_rad: float | None = None, grown: int = 8
+) -> F64:
     """(N, 3) places of a stretch that two loops tie at its start, in the frame of a keyframe before
-    it; its attitudes are off by a constant, and vision drifts."""
+    it, once it has ``grown``; its attitudes are off by a constant, and vision drifts. With
+    ``mount_rad`` they are those of a mount that is assumed, and off by so much."""
     f, before, graph = flight(72, scale=1.0, seed=5), 12, PoseGraph(bias_tau_s=WHITE)
     rng, spread = np.random.default_rng(3), np.diag([5e-3**2] * 3 + [0.05**2] * 3)
     off, odom = se3.so3_exp(np.array([tilt_rad, 0.0, compass_rad])), f.odom[0]
@@ -564,9 +567,12 @@ def tied_stretch(compass_rad: float, tilt_rad: float = 0.0) -> F64:
         is_tied = i >= before
         R = off @ T[:3, :3] if is_tied else T[:3, :3]
         prior = PosePrior(R_world_camera=R, sigma_tilt_rad=0.02, sigma_yaw_rad=0.1)
+        if mount_rad is not None:
+            R = R @ se3.so3_exp(np.array([0.0, mount_rad * is_tied, 0.0]))
+            prior = replace(prior, R_world_camera=R, is_view_assumed=True)
         at = turned @ odom if is_tied else odom
         graph.add_keyframe(i, (i + 20 * is_tied) * 10**9, int(is_tied), at, spread, prior)
-        if i == before + 8:
+        if i == before + grown:
             for a, b in ((3, before + 3), (5, before + 6)):
                 seen = se3.inverse(f.truth[a]) @ f.truth[b]
                 graph.add_loop(a, b, seen, LOOP_COVARIANCE, graph.scale(a) / graph.scale(b))
@@ -581,6 +587,12 @@ def test_a_stretch_that_loops_tie_is_not_bent_by_what_is_constant_in_its_attitud
     """It would be off by four and six metres, were they still those from its place before."""
     places, truth = tied_stretch(compass_rad, tilt_rad), tied_stretch(0.0)
     assert np.linalg.norm(places - truth, axis=1).max() < 0.3
+
+
+def test_a_stretch_that_loops_tie_keeps_what_its_turns_say_of_the_mount() -> None:
+    """It would be off by 18 metres, were the mount again taken to be as assumed."""
+    places, truth = (tied_stretch(0.0, mount_rad=rad, grown=45) for rad in (0.1, 0.0))
+    assert np.linalg.norm(places - truth, axis=1).max() < 1.0
 
 
 @pytest.mark.parametrize("seed", [1, 2])
