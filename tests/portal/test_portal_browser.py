@@ -99,7 +99,7 @@ def test_the_cloud_grows_and_moves_while_one_looks(
     assert [u for u in outside if not u.startswith(("blob:", "about:", "chrome"))] == []
 
 
-def test_the_scale_of_heights_follows_what_comes(
+def test_the_scale_of_heights_follows_what_comes_and_moves(
     browser: Browser, portal: Portal, scans: Path, house: HouseFlight
 ) -> None:
     browser.open("about:blank")
@@ -112,7 +112,10 @@ def test_the_scale_of_heights_follows_what_comes(
         one = house.keyframe(5, 30.0)
         one.depth.T_world_camera[2, 3] += 30.0  # over a hill
         scan.add_keyframe(5, encode(one, one.time_ns))
-    assert browser.wait(f"{top} > {before + 20.0} && {top}") < before + 40.0
+        grown = browser.wait(f"{top} > {before + 20.0} && {top}")
+        assert grown < before + 40.0
+        scan.add_reposes([Repose(5, 1, house.pose(30.0), 1.0, np.eye(6))])  # there was none
+    assert browser.wait(f"{top} < {grown - 20.0} && {top}") == pytest.approx(before, abs=3.0)
 
 
 def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:

@@ -28,6 +28,7 @@ const SHARP_PX = 1.3; // of the screen, between two vertices of a surface
 const BUILD_MS = [25, 60] as const; // for finer surfaces, a frame while the view moves, and at rest
 const GROUND_SAMPLES = 400_000; // of the heightfield below
 const GROUND_MS = 1500; // between two of them
+const SAMPLED = 40_000; // values that a range of colours is of: it is found again while the scan grows
 const NEWEST = 5; // keyframes that tell how far the camera looks
 const MAX_TRIANGLES = 12_000_000; // in memory
 
@@ -128,8 +129,8 @@ export class Cloud implements Gradual {
   private readonly past = new THREE.Group();
   private readonly before = new Before();
   private isStale = false;
-  private isUnscaled = false; // something came since the range of the colours was set
-  /** Called when the range of the colours has followed what came. */
+  private isUnscaled = false; // something came or moved since the range of the colours was set
+  /** Called when the range of the colours has followed what came or moved. */
   scaled: () => void = () => undefined;
   /** Called when there are parts to colour by. */
   named = (): void => undefined;
@@ -192,7 +193,7 @@ export class Cloud implements Gradual {
   /** Adds a keyframe, in place of the one with the same number; of one that is withdrawn nothing stays. */
   add(chunk: Chunk): void {
     this.remove(chunk.seq);
-    this.groundStale = this.isUnscaled = true;
+    this.groundStale = true;
     if (isVoid(chunk)) return;
     const { xyz, rgb, sigma, views, unit_m } = pointsOf(chunk);
     const geometry = new THREE.BufferGeometry();
@@ -519,15 +520,16 @@ export class Cloud implements Gradual {
     this.shared.range.value.set(0, MAX_SIGMA_M * this.sample("sigma", (sigma, i) => sigma.getX(i))(0.98));
   }
 
-  /** Quantiles of a figure of 200 points of each chunk. */
+  /** Quantiles of a figure of some points of each chunk, at most 200. */
   private sample(
     name: string,
     figure: (values: THREE.BufferAttribute | THREE.InterleavedBufferAttribute, i: number, object: THREE.Object3D) => number,
   ): (share: number) => number {
     const found: number[] = [];
+    const each = Math.min(200, Math.ceil(SAMPLED / this.chunks.size));
     for (const { object } of this.chunks.values()) {
       const values = object.geometry.getAttribute(name);
-      for (let i = 0; i < Math.min(values.count, 200); i++) found.push(figure(values, i, object));
+      for (let i = 0; i < Math.min(values.count, each); i++) found.push(figure(values, i, object));
     }
     found.sort((a, b) => a - b);
     return (share) => found[Math.floor(share * (found.length - 1))] ?? 0;
@@ -546,7 +548,7 @@ export class Cloud implements Gradual {
     const unit = held.unit_m * held.scale;
     const move = this.moves.get(Math.floor(seq / STRIDE));
     this.isStale ||= this.earlier.has(Math.floor(seq / STRIDE));
-    this.groundStale = true;
+    this.groundStale = this.isUnscaled = true;
     for (const [object, size] of [[held.object, unit], [held.surface.mesh, held.scale]] as [THREE.Object3D, number][]) {
       object.matrix.fromArray(held.T).scale(new THREE.Vector3(size, size, size));
       if (move) object.matrix.premultiply(move);
