@@ -154,9 +154,10 @@ class Frame:
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
-        if self.relative is None:
-            return se3.inverse(self.T_camera_odom)
-        return self.relative.T_odom_camera
+        if self.relative is not None:
+            return self.relative.T_odom_camera
+        assert self.T_camera_odom[3, 3] == 1.0, "the frame is not tracked"  # else NaN
+        return se3.inverse(self.T_camera_odom)
 
     def known_points(self) -> tuple[Bool, F64]:
         """(N,) which corners of a keyframe have a landmark, and (M, 3) those in its camera, in

@@ -108,6 +108,11 @@ def test_a_lost_frame_is_placed_by_telemetry_that_knows_its_heading() -> None:
     assert lost(replace(known, position_m=None, sigma_position_m=None)) is None
 
 
+def test_a_frame_that_is_not_tracked_has_no_place_in_the_odometry() -> None:
+    with pytest.raises(AssertionError, match="not tracked"):
+        _ = Frame(NO_IMAGE, 0, 1).T_odom_camera
+
+
 def some_pose() -> F64:
     return se3.exp(RNG.normal(size=6))
 
