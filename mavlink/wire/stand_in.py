@@ -36,14 +36,14 @@ class StandIn:
     Where it cannot start, or ends, heartbeats are ours alone, and the log says so.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, python: str = sys.executable) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._channel, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._channel.setblocking(False)
         with other:
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-IS", __file__, str(other.fileno())],
+                    [python, "-IS", __file__, str(other.fileno())],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     pass_fds=[other.fileno()],

@@ -180,16 +180,21 @@ def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
     command += [word for option, path in of.items() for word in (option, str(path))]
 
     def goes_on(line: str) -> bool:
-        if said := DONE.fullmatch(line):
-            line, percent = said.groups()
-            if percent is not None:
-                progress.share = int(percent) / 100
-        progress((line or "replay")[:80])
+        follow(progress, line)
         return True
 
     fault = run_to_end("replay", [*command, "--out", str(out)], goes_on)
     if fault:
         raise InputError(OWN_PATH.sub("", fault))
+
+
+def follow(progress: Progress, line: str) -> None:
+    """Take step and share from a line that ``replay`` says."""
+    if said := DONE.fullmatch(line):
+        line, percent = said.groups()
+        if percent is not None:
+            progress.share = int(percent) / 100
+    progress((line or "replay")[:80])
 
 
 def unpack(archive: Path, folder: Path, room_bytes: int | None = None) -> None:

@@ -105,7 +105,8 @@ def test_the_first_heartbeats_go_on_too(ear: Ear) -> None:
     try:
         during, all_ = heard_while_the_lock_is_held(ear)
     finally:
-        first.hand_over()
+        for link in first.hand_over():
+            link.stop()
         assert first.stand_in is not None
         first.stand_in.close()
     assert len(during) > 0
@@ -165,7 +166,7 @@ def test_it_ends_in_silence_though_its_last_answers_were_not_read(
 
 
 def test_a_process_that_does_not_start_or_ends_is_said_and_costs_nothing_else(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     before = set(psutil.Process().children())
     stand_in = StandIn()
@@ -181,8 +182,7 @@ def test_a_process_that_does_not_start_or_ends_is_said_and_costs_nothing_else(
     stand_in.plan([], list)
     stand_in.close()
     assert len(caplog.records) == 1
-    monkeypatch.setattr("sys.executable", "/nowhere/python")
-    stand_in = StandIn()
+    stand_in = StandIn("/nowhere/python")
     stand_in.plan([], list)
     assert "does not start" in caplog.text and stand_in.sent() == 0
     stand_in.close()

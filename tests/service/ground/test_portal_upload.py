@@ -8,7 +8,6 @@ import json
 import socket
 import time
 import zipfile
-from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,9 +181,7 @@ def test_an_upload_fits_the_disk(store: Path) -> None:
     assert nothing_left(store)
 
 
-def test_a_replay_tells_its_step_and_share_also_where_a_line_is_said_again(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_replay_tells_its_step_and_share_also_where_a_line_is_said_again() -> None:
     said, lines, progress = io.StringIO(), list[str](), Progress()
     with redirect_stderr(said), speaking(quiet_s=0.02) as say:
         for line in ("replay: reading", "replay: tracking, 35 %"):
@@ -194,15 +191,9 @@ def test_a_replay_tells_its_step_and_share_also_where_a_line_is_said_again(
                 time.sleep(0.005)
             lines.append(said.getvalue().splitlines()[1])
     seen = []
-
-    def run_to_end(_: str, __: Sequence[str], goes_on: Callable[[str], bool]) -> str:
-        for line in lines:
-            goes_on(line)
-            seen.append((progress.text, progress.share))
-        return ""
-
-    monkeypatch.setattr(upload, "run_to_end", run_to_end)
-    upload._replay([tmp_path / "a.mp4", tmp_path / "a.tlog"], tmp_path / "out", progress)
+    for line in lines:
+        upload.follow(progress, line)
+        seen.append((progress.text, progress.share))
     assert seen == [("replay: reading", 0.0), ("replay: tracking", 0.35)]
 
 
