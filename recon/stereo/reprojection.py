@@ -260,10 +260,11 @@ def fuse(
     """
     depth = np.stack([p.depth_m for p in pairs])
     sigma = np.stack([p.sigma_m for p in pairs])
-    out = _fused(depth, sigma, K, T_world_camera, config)
-    if noise > 1.0 and out.views.any():
-        out = _fused(depth, np.float32(noise) * sigma, K, T_world_camera, config)
-    return out
+    if noise > 1.0:
+        rows = [np.ascontiguousarray(a[:, ::NOISE_STRIDE]) for a in (depth, sigma)]
+        if _fused(rows[0], rows[1], K, T_world_camera, config).views.any():  # not refuted
+            sigma *= np.float32(noise)
+    return _fused(depth, sigma, K, T_world_camera, config)
 
 
 def _fused(
