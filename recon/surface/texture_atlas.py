@@ -23,7 +23,7 @@ MARGIN_PX = 1.5
 """Texels so far from a chart are painted as if it went on: four around a place at its edge, and all
 of a triangle so narrow that no texel's centre lies in it."""
 
-LEAST_WEIGHT = -2.0
+MIN_WEIGHT = -2.0
 """Of a corner, for a place beyond the edge opposite: farther out a sliver goes on along its longest
 edge, as its own plane leads anywhere."""
 
@@ -365,7 +365,7 @@ def _paint(
                     continue
                 if a < least[0] or b < least[1] or c < least[2]:
                     continue
-                if min(a, b, c) < LEAST_WEIGHT:
+                if min(a, b, c) < MIN_WEIGHT:
                     a, b, c = _on_longest_edge(uv[f], col + 0.5, row + 0.5)
                 a, b, c = a / depth[0], b / depth[1], c / depth[2]
                 whole = a + b + c

@@ -112,7 +112,7 @@ EQUILATERAL = 0.25 * 3.0**0.5
 
 def steady_normals(corners: F64, neighbours: I32) -> tuple[F64, F64]:
     """(F,) areas of triangles (F, 3, 3) and (F, 3) unit normals, means with those of their
-    ``neighbours`` (F, 3; -1: none): what is left of a sliver's own is noise, and it would take
+    ``neighbours`` (F, 3; -1: none): a sliver's own normal is noise, and it would take
     another view than the surface around it.
 
     A neighbour weighs no more than an equilateral triangle on the edge that both share, so that

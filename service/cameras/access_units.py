@@ -31,7 +31,7 @@ IS_PICTURE: dict[str, Callable[[int], bool]] = {
     "h264": lambda first: 1 <= first & 0x1F <= 5,
     "hevc": lambda first: first & 0x7F < 64,
 }
-"""Whether a NAL unit has a part of a picture, by codec."""
+"""Whether a NAL unit has a part of a image, by codec."""
 
 
 def access_units(
@@ -84,7 +84,7 @@ def access_units(
 
 
 def _headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet[Any]]:
-    """The packets, those that hold nothing of a picture joined to the next one.
+    """The packets, those that hold nothing of a image joined to the next one.
 
     Some senders give the parameter sets of a key frame a packet of their own.
     """
@@ -98,7 +98,7 @@ def _headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet
             if is_started and not any(is_picture(nal[0]) for nal in START.findall(data)):
                 head += data
                 continue
-        if head and packet.size:  # else no picture follows
+        if head and packet.size:  # else no image follows
             packet, head = _timed(av.Packet(head + bytes(packet)), packet), b""
         yield packet
 

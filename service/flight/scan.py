@@ -214,7 +214,7 @@ class Scan:
         return motion_blur(odometry.exposure, float(self.inputs.camera.K[0, 0] / odometry.K[0, 0]))
 
     def _report_blur(self) -> None:
-        """Tell the operator once that the shutter is too slow for the speed."""
+        """Report to the operator once that the shutter is too slow for the speed."""
         if not self._is_blur_reported and (blur := self.motion_blur) is not None:
             self._is_blur_reported = True
             self.inputs.warn(f"Shutter too slow: images blur by {blur['blur_px']:.0f} px")

@@ -75,7 +75,7 @@ def write_files(
 
 
 class Files(Enum):
-    """Those beside the database of an open scan."""
+    """Those next to the database of an open scan."""
 
     WRITTEN = "written"
     DUE = "due"  # the scan grew

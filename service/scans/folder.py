@@ -255,7 +255,7 @@ class _Files:
         """Write preview, thumbnail and report; returns the content of scan.json."""
         with self.failures.noted(PREVIEW):
             self._raster = surface(self._fused, self._cell_m)
-        release_memory()  # what each step leaves is not there beside the next
+        release_memory()  # so that what a step leaves does not add to the next
         summary = self.summary(extra)
         poses = main_poses(self._poses, stretches_apart(self._store))
         maps = None

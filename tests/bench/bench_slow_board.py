@@ -4,7 +4,7 @@
 with its telemetry, while all its threads stand still for a share of every 20 ms. On two cores, half
 of the time is in all what four cores of a quarter of this machine's speed do, with faster single
 threads; a quarter of the time is the speed of those cores, two of them. The board lies between.
-Nothing is said of its caches and its memory. The peer of a figure is what the ladder allows.
+Its caches and its memory are not emulated. The peer of a figure is what the ladder allows.
 
 make bench ARGS="slow --flight FLIGHT" plays a flight of ``skyrelief simulate``.
 """

@@ -10,7 +10,7 @@ counts from an unknown direction. Their axes are x right, y down, z ahead. Times
 own; samples spread over the time of their packet, those of GPS9 and a drone by their own clock.
 GPSU dates the recording, whose container has local time; a HERO13 writes no GPSU, but GPS9 has a
 date of its own. Altitudes are above the ellipsoid unless GPSA says MSLV: those of a HERO5 to 7, a
-Fusion and a MAX beside the sea are 35 m below it, as the ellipsoid is there.
+Fusion and a MAX at the coast are 35 m below it, as the ellipsoid is there.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import scipy.ndimage as ndi
+from spied import spied
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
@@ -384,8 +385,7 @@ def test_after_a_loop_the_search_waits_until_the_view_has_moved_on(
 
 
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, tried = view(A, 1), list[int]()
-    monkeypatch.setattr(loop_search, "verify", lambda *_: tried.append(1))
+    seen, verified = view(A, 1), spied(monkeypatch, loop_search, "verify")
     trajectory = Trajectory()
     search = LoopSearch(trajectory, max_views=6)
     rng = np.random.default_rng(4)
@@ -394,4 +394,4 @@ def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPa
         trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
         search.look(i, 0, rng.integers(0, 255, seen.gray.shape, np.uint8), K, seen.depth)
         assert len(search) <= 6
-    assert not tried
+    assert not verified.called

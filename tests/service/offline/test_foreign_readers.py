@@ -30,7 +30,7 @@ def written(folder: Path, kind: str) -> Path:
 
 
 def features(scan_dir: Path, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What GDAL says of the only layer, and its columns."""
+    """The only layer as GDAL reads it, and its columns."""
     pyogrio = pytest.importorskip("pyogrio")
     path = written(scan_dir, kind)
     facts = pyogrio.read_info(path, force_total_bounds=True)

@@ -29,7 +29,7 @@ const BUILD_MS = [25, 60] as const; // for finer surfaces, a frame while the vie
 const GROUND_SAMPLES = 400_000; // of the heightfield below
 const GROUND_MS = 1500; // between two of them
 const SAMPLED = 40_000; // values that a range of colours is of: it is found again while the scan grows
-const NEWEST = 5; // keyframes that tell how far the camera looks
+const NEWEST = 5; // keyframes that show how far the camera looks
 const MAX_TRIANGLES = 12_000_000; // in memory
 
 /** GLSL: the colour that a place is shown in; linear, as `rgb`. */
