@@ -145,10 +145,11 @@ def label_noise(depth: Tensor, sigma: Tensor) -> Tensor:
     error = sigma[:, ::NOISE_STRIDE, ::NOISE_STRIDE] * inverse * inverse
     squares, known = torch.zeros((2, 1), device=depth.device)
     for i, j in combinations(range(len(depth)), 2):
-        apart = ((inverse[i] - inverse[j]).abs() / torch.hypot(error[i], error[j])).reshape(1, -1)
-        apart = torch.where(apart.isfinite(), apart, torch.nan)
-        enough = (apart == apart).sum() >= MIN_COMMON
-        middle = apart.nanmedian(dim=1).values / 0.6745
+        apart = ((inverse[i] - inverse[j]).abs() / torch.hypot(error[i], error[j])).ravel()
+        apart = torch.where(apart.isfinite(), apart, torch.inf).sort().values
+        count = apart.isfinite().sum()
+        enough = count >= MIN_COMMON
+        middle = apart.gather(0, ((count - 1).clamp(min=0) // 2).reshape(1)) / 0.6745  # no wait
         squares = squares + torch.where(enough, middle * middle, 0.0)
         known = known + enough
     noise = (squares / known.clamp(min=1) / (1.0 - PAIRS_CORRELATION)).sqrt()
