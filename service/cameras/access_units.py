@@ -27,11 +27,11 @@ LONGEST_HEAD = 4096
 START = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 """The start code of a NAL unit, and its first byte."""
 
-IS_PICTURE: dict[str, Callable[[int], bool]] = {
+IS_VCL: dict[str, Callable[[int], bool]] = {
     "h264": lambda first: 1 <= first & 0x1F <= 5,
     "hevc": lambda first: first & 0x7F < 64,
 }
-"""Whether a NAL unit has a part of a image, by codec."""
+"""Whether a NAL unit, by its first byte, is of the video coding layer: a part of an image."""
 
 
 def access_units(
@@ -84,18 +84,18 @@ def access_units(
 
 
 def _headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet[Any]]:
-    """The packets, those that hold nothing of a image joined to the next one.
+    """The packets, those that hold nothing of an image joined to the next one.
 
     Some senders give the parameter sets of a key frame a packet of their own.
     """
     import av
 
-    is_picture, head = IS_PICTURE.get(codec), b""
+    is_vcl, head = IS_VCL.get(codec), b""
     for packet in packets:
-        if is_picture is not None and 0 < packet.size <= LONGEST_HEAD - len(head):
+        if is_vcl is not None and 0 < packet.size <= LONGEST_HEAD - len(head):
             data = bytes(packet)
             is_started = START.search(data[:5])
-            if is_started and not any(is_picture(nal[0]) for nal in START.findall(data)):
+            if is_started and not any(is_vcl(nal[0]) for nal in START.findall(data)):
                 head += data
                 continue
         if head and packet.size:  # else no image follows
