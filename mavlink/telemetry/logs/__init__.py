@@ -102,6 +102,9 @@ class Track:
 ELLIPSOID = "ellipsoid"
 """The datum of altitudes that are not above mean sea level."""
 
+NEIGHBOUR_S = 10.0
+"""Samples of a log follow each other that closely; one that is farther off both is damaged."""
+
 SAME_LENS = 0.02
 """Relative tolerance of a lens that does not zoom."""
 

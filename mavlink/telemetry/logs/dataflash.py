@@ -23,7 +23,7 @@ from mavlink.telemetry.decode import (
     receiver_accuracy,
 )
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, finish, values_near
+from mavlink.telemetry.logs import NEIGHBOUR_S, TelemetryLog, finish, values_near
 from mavlink.telemetry.quaternion import Vector, from_degrees
 from mavlink.telemetry.samples import (
     AccuracySample,
@@ -39,9 +39,6 @@ from mavlink.wire.tlog import LATEST_USEC
 
 HEADER = b"\xa3\x95"
 UNIX_FROM_S = 1e9
-NEIGHBOUR_S = 10.0
-"""Messages of a log follow each other that closely; one that is farther off both is damaged."""
-
 FRESH_S = 0.25
 NEAR_S = 0.05
 """Rates of the body are known so long before and after a sample of theirs."""

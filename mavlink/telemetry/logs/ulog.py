@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mavlink.telemetry.decode import CLEARANCE_SIGMA_M, DOWNWARD, plausible_place, receiver_accuracy
 from mavlink.telemetry.gimbal import frame_of_flags
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, finish, values_near
+from mavlink.telemetry.logs import NEIGHBOUR_S, TelemetryLog, finish, values_near
 from mavlink.telemetry.quaternion import Vector, normalised
 from mavlink.telemetry.samples import (
     F64,
@@ -55,7 +55,6 @@ PLACES = ("vehicle_global_position", "vehicle_local_position", "vehicle_gps_posi
 """Topics with a position, best first; a later one gives them before and after those of a better
 one: an estimate may begin long after the receiver's fixes, or end."""
 
-NEIGHBOUR_US = 10_000_000
 NEAR_US = 250_000
 """Velocities are known so long before and after a sample of theirs."""
 
@@ -90,7 +89,7 @@ def _is_beside(times_us: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether a sample is close in time to the one before or after it; others are damaged."""
     if len(times_us) < 2:
         return np.ones(len(times_us), bool)
-    is_close = np.abs(np.diff(times_us)) <= NEIGHBOUR_US
+    is_close = np.abs(np.diff(times_us)) <= 1e6 * NEIGHBOUR_S
     return np.append(is_close, False) | np.insert(is_close, 0, False)
 
 
