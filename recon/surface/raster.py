@@ -143,14 +143,24 @@ def round_cell(cell_m: float, up: bool = False) -> float:
     return round(power * max(n for n in ROUND if n <= ratio + 1e-6), 9)
 
 
+def bounds_of(xy_m: Array) -> tuple[float, float, float, float]:
+    """(west, south, east, north) of one point or more (N, 2); NaN where a coordinate is.
+
+    One axis after the other takes a tenth to a thirtieth of the time of both at once.
+    """
+    (west, east), (south, north) = ((float(c.min()), float(c.max())) for c in xy_m.T)
+    return west, south, east, north
+
+
 def grid_over(xy_m: F64 | F32, cell_m: float, margin_cells: int = 0) -> Grid:
     """The grid of ``cell_m`` that covers (N, 2) points, its edges on multiples of the cell."""
     xy = np.asarray(xy_m)
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise ValueError(f"expected points of shape (N, 2) with N > 0, got {xy.shape}")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        low = np.floor(np.array([c.min() for c in xy.T], np.float64) / cell_m) - margin_cells
-        high = np.floor(np.array([c.max() for c in xy.T], np.float64) / cell_m) + 1 + margin_cells
+        west, south, east, north = bounds_of(xy)
+        low = np.floor(np.array([west, south]) / cell_m) - margin_cells
+        high = np.floor(np.array([east, north]) / cell_m) + 1 + margin_cells
         cells = float(np.prod(high - low))
     if not cells <= min(LARGEST_CELLS, max(MIN_CELLS, CELLS_PER_POINT * len(xy))):
         raise ValueError(_too_large(high[1] - low[1], high[0] - low[0]))

@@ -24,7 +24,7 @@ import numpy as np
 
 from recon.mapping.cloud_fusion import joined
 from recon.parallel import run_parallel
-from recon.surface.raster import Raster, grid_over, rasterise
+from recon.surface.raster import Raster, bounds_of, grid_over, rasterise
 from recon.types import U8, PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.memory import release_memory
@@ -348,10 +348,7 @@ def surface(fused: FusedCloud, cell_m: float | None = None) -> Raster | None:
     if not len(fused.cloud):
         return None
     xy = fused.cloud.xyz_m[:, :2]
-    # One axis after the other takes a tenth of the time.
-    ends = [(float(c.min()), float(c.max())) for c in xy.T]
-    (west, east), (south, north) = ends
-    cell_m = cell_m or preview_cell_m((west, south, east, north), fused.voxel_m)
+    cell_m = cell_m or preview_cell_m(bounds_of(xy), fused.voxel_m)
     return rasterise(fused.cloud, grid_over(xy, cell_m, margin_cells=1))
 
 

@@ -25,6 +25,7 @@ from recon.mapping.cloud_fusion import (
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
 from recon.parallel import run_parallel, threads
+from recon.surface.raster import bounds_of
 from recon.types import F64, I64, U8, Keyframe, PointCloud
 from service.georeference import LocalFrame, map_crs
 from service.memory import release_memory
@@ -128,9 +129,7 @@ def extents_of(
         sample = ground_sample_m(keyframe.depth)
         cloud = _points(keyframe, box)
         if sample is not None and len(cloud):
-            # One axis after the other takes a thirtieth of the time of both.
-            (west, east), (south, north) = ((c.min(), c.max()) for c in cloud.xyz_m[:, :2].T)
-            around = float(west), float(south), float(east), float(north)
+            around = bounds_of(cloud.xyz_m[:, :2])
             out.append(Extent(keyframe.seq, len(cloud), sample, around))
             room -= len(cloud)
             if room >= 0:
