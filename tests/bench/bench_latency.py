@@ -17,13 +17,14 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from command_line import command_process
 
 from service.bench import BenchOptions, BenchResult
 from service.bench.link_emulator import LinkEmulator, LinkModel
@@ -33,7 +34,6 @@ from service.listener import free_ports
 from service.packages import needing
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
-from service.workers import end_process, python_command
 
 LOOK_S = 0.01
 PATIENCE_S = 240.0
@@ -108,14 +108,14 @@ def _fly(trial: Trial, folder: Path, open_now: ExitStack) -> Outcome:
         f"health.http=127.0.0.1:{at_status}", f'datalink.connect=["tcp/127.0.0.1:{at_link}"]',
         f"datalink.budget_kbit_s={trial.link.rate_kbit_s}", "datalink.drain_s=0", *trial.settings,
     ]  # fmt: skip
-    ends = [
-        open_now.enter_context(_process(folder / f"{words[0]}.log", words))
-        for words in (
-            ["ground", "--listen", f"tcp/127.0.0.1:{at_ground}", "--store", str(received),
-             "--portal", f"127.0.0.1:{at_portal}"],
-            ["run", *(word for setting in settings for word in ("--set", setting))],
-        )
-    ]  # fmt: skip
+    ends: list[tuple[subprocess.Popen[bytes], Path]] = []
+    for words in (
+        ["ground", "--listen", f"tcp/127.0.0.1:{at_ground}", "--store", str(received),
+         "--portal", f"127.0.0.1:{at_portal}"],
+        ["run", *(word for setting in settings for word in ("--set", setting))],
+    ):  # fmt: skip
+        log = folder / f"{words[0]}.log"
+        ends.append((open_now.enter_context(command_process(log, *words)), log))
     drone = open_now.enter_context(_store(onboard, "*", ends))
     ground = open_now.enter_context(_store(received, "drones/*/*", ends))
     watch = _Watch(drone, ground)
@@ -135,20 +135,6 @@ def _fly(trial: Trial, folder: Path, open_now: ExitStack) -> Outcome:
     ):
         watch.camera_ms = json.load(answer).get("camera_latency_ms", watch.camera_ms)
     return watch.outcome(began_ns, ended_ns)
-
-
-@contextmanager
-def _process(log: Path, words: Sequence[str]) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
-    """A command of ours in a process of its own, and its log."""
-    with log.open("wb") as said:
-        process = subprocess.Popen(
-            python_command("service.cli", *words), stdin=subprocess.DEVNULL, stdout=said,
-            stderr=said, start_new_session=True,
-        )  # fmt: skip
-    try:
-        yield process, log
-    finally:
-        end_process(process, 30.0)
 
 
 Ends = Sequence[tuple[subprocess.Popen[bytes], Path]]

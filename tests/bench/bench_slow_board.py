@@ -28,12 +28,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from bench_options import DataOptions
+from command_line import command_process
 
 from service.bench import BenchResult
 from service.daemon.load_shedding import LATE_FRAMES, LATE_VIEWS, OLDEST_S
 from service.errors import OutsideError
 from service.listener import free_ports
-from service.workers import end_process, python_command
+from service.workers import python_command
 
 SHARES = {"half of the time": 0.5, "a quarter of the time": 0.25}
 PERIOD_S, LOOK_S = 0.02, 0.5
@@ -123,30 +124,17 @@ def fly(
         "compute.backend": backend,
     }
     process = open_now.enter_context(
-        _process(folder / "run.log", "run", *(
+        command_process(folder / "run.log", "run", *(
             word for key, value in settings.items() for word in ("--set", f"{key}={value}")
         ))
     )  # fmt: skip
     open_now.enter_context(
-        _process(folder / "camera.log", "simulate", "--out", str(flight), "--live", "--loop",
-                 "--video-to", f"udp://127.0.0.1:{video}?pkt_size=1316",
-                 "--mavlink-to", f"127.0.0.1:{telemetry}")
+        command_process(folder / "camera.log", "simulate", "--out", str(flight), "--live", "--loop",
+                        "--video-to", f"udp://127.0.0.1:{video}?pkt_size=1316",
+                        "--mavlink-to", f"127.0.0.1:{telemetry}")
     )  # fmt: skip
     with slowed(process.pid, share):
         return list(_looks(process, f"http://127.0.0.1:{at_status}/status", folder, watched_s))
-
-
-@contextmanager
-def _process(log: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
-    with log.open("wb") as said:
-        process = subprocess.Popen(
-            python_command("service.cli", *words), stdin=subprocess.DEVNULL, stdout=said,
-            stderr=said, start_new_session=True,
-        )  # fmt: skip
-    try:
-        yield process
-    finally:
-        end_process(process, 60.0)
 
 
 def _looks(

@@ -1,4 +1,4 @@
-"""The command line without a process of its own: the same exit codes and messages."""
+"""The command line, in this process or in one of its own: the same exit codes and messages."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import signal
 import subprocess
 import sys
 import threading
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 
 from service.cli import main
+from service.workers import end_process, python_command
 
 
 def skyrelief(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -30,3 +32,17 @@ def skyrelief(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
         for number, handler in handlers.items():
             signal.signal(number, handler)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def command_process(log: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A command in a process of its own, which writes to ``log`` and is ended at the end."""
+    with log.open("wb") as said:
+        process = subprocess.Popen(
+            python_command("service.cli", *words), stdin=subprocess.DEVNULL, stdout=said,
+            stderr=said, start_new_session=True,
+        )  # fmt: skip
+    try:
+        yield process
+    finally:
+        end_process(process, 60.0)
