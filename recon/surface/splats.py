@@ -249,11 +249,10 @@ def _merged(found: Sequence[_Pixels], depths: Sequence[DepthMap]) -> list[I64]:
     """The pixels of each view that stay: without what other views see through, and one where
     several images show a place."""
     first = np.cumsum([0, *(len(one.sigma_m) for one in found)])
-    places_m, sigma_m, footprint_m = (
+    places_m, sigma_m, footprint_m, opacity = (
         np.concatenate([getattr(one, name) for one in found])
-        for name in ("places_m", "sigma_m", "footprint_m")
+        for name in ("places_m", "sigma_m", "footprint_m", "opacity")
     )
-    opacity = np.concatenate([one.opacity for one in found])
     seen = np.where(opacity > SINGLE + 1e-3, 2, 1).astype(np.uint8)
     cloud = PointCloud(places_m, np.zeros((len(seen), 3), np.uint8), sigma_m, seen)
     kept = np.flatnonzero(~seen_through(cloud, spread(depths))) if len(seen) else first[:0]

@@ -250,8 +250,8 @@ def looks_inside(scan: ScanView) -> Callable[[Camera, F64], Bool]:
         ways = _pixel_rays(camera.K, w, h) @ T[:3, :3].T
         middle = T[:3, 3] if frame is None else frame.to_utm(T[None, :3, 3])[0]
         level_m = np.full(len(ways), float(np.nanmedian(raster.height_m)))
+        down = np.minimum(ways[:, 2], -0.05)
         for _ in range(LEVELS):
-            down = np.minimum(ways[:, 2], -0.05)
             drop = np.where(ways[:, 2] < -0.05, (level_m - middle[2]) / down, 0.0)
             ground = T[:3, 3] + ways * drop[:, None]
             places = ground if frame is None else frame.to_utm(ground)
