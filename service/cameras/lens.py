@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from recon.camera_model import check_camera, scaled
+from recon.camera_model import check_camera, scaled, scaled_K
 from recon.types import Camera
 from service.errors import InputError
 
@@ -40,6 +40,10 @@ before the camera straightens and crops them (docs/reports/lens.md)."""
 SIGMA_K1 = 0.02
 """Sigma of a lens's first radial coefficient where tags give its focal length alone: what is left
 in stills that drones straighten themselves."""
+
+SIGMA_OTHER_SHAPE = 0.15
+"""Relative sigma of a focal length where a camera goes over to another shape: 16:9 has the rows in
+the middle of 4:3, but a program that cuts 4:3 out of 16:9 takes its columns, a third fewer."""
 
 CALIBRATED, FOCAL_ALONE = "the maker's calibration", "the maker's focal length"
 AGREEMENT = 0.1
@@ -93,7 +97,7 @@ def same_shape(a_px: tuple[int, int], b_px: tuple[int, int]) -> bool:
 
 def fitted(camera: Camera, source: CameraSource) -> tuple[Camera, list[str]]:
     """The camera model for a source's images, with a note if it is scaled to their size;
-    InputError for another aspect ratio.
+    InputError for another aspect ratio, unless the camera went over to it in flight.
 
     The model may be for the images as stored: some sources turn them when they are read.
     """
@@ -106,10 +110,29 @@ def fitted(camera: Camera, source: CameraSource) -> tuple[Camera, list[str]]:
         if same_shape(model.size_px, size_px):
             note = f"the camera model is for {w}x{h} images: scaled to {W}x{H}"
             return scaled(model, size_px), [note]
+    if source.is_reshaped:
+        note = (
+            f"the camera model is for {w}x{h} images: that of {W}x{H} is derived from it, as if "
+            "both showed as much along their longer side; calibrate at that size"
+        )
+        return reshaped(camera, size_px), [note]
     raise InputError(
         f"the camera model is for {w}x{h} images, {source.description} has {W}x{H}; "
         "calibrate at that size"
     )
+
+
+def reshaped(camera: Camera, size_px: tuple[int, int]) -> Camera:
+    """The camera for images of another shape: as wide a view along the longer side, about the same
+    centre; upright images of a camera that was turned by a quarter."""
+    if (size_px[0] > size_px[1]) != (camera.size_px[0] > camera.size_px[1]):
+        camera = turned(camera, 90)
+    if same_shape(camera.size_px, size_px):
+        return scaled(camera, size_px)
+    ratio = max(size_px) / max(camera.size_px)
+    K = scaled_K(camera.K, ratio, ratio)
+    K[:2, 2] += 0.5 * (np.array(size_px) - ratio * np.array(camera.size_px))
+    return replace(camera, K=K, size_px=size_px, sigma_focal=SIGMA_OTHER_SHAPE)
 
 
 def check_width(camera: Camera, what: str) -> None:

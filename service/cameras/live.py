@@ -52,6 +52,9 @@ V4L2_OPTIONS = ("video_size", "framerate", "input_format")
 
 OPEN_S = 10.0
 
+CHANGED_NS = 1_000_000_000
+"""Images of another shape that come for this long are no fault of the stream."""
+
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
 """The last one: open the stream at once, without waiting some twenty images for its rate."""
 
@@ -117,7 +120,7 @@ class StampFilter:
 
 
 class LiveSource(CameraSource):
-    """Images of a stream that is reopened whenever it is lost."""
+    """Images of a stream that is reopened whenever it is lost; ends where their shape changes."""
 
     is_live = True
 
@@ -142,6 +145,7 @@ class LiveSource(CameraSource):
         self._open_container = open_container
         self._closed = Event()
         self._iterated = False
+        self._next: tuple[U8, int] | None = None  # the first one that is of another shape to stay
         self._is_silent = False  # at the last attempt
         self._images = self._connect()
         first = next(self._images, None)
@@ -156,12 +160,27 @@ class LiveSource(CameraSource):
         self._first = first
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield images until :meth:`close`; then, or when dropped, release the stream."""
+        """Yield images until :meth:`close` or another shape; then, or when dropped, release the
+        stream, unless another source follows."""
         self._iterated = True
         try:
             yield from self._frames()
         finally:
-            self._images.close()
+            if self._next is None:
+                self._images.close()
+            else:
+                self._iterated = False
+
+    def following(self) -> CameraSource | None:
+        if self._next is None or self._closed.is_set():
+            return None
+        image, time_ns = self._next
+        self._first, self._next = (image, 0), None
+        self._start_ns += time_ns
+        self.start_monotonic_ns, self.epoch_unix_ns = self._start_ns, time.time_ns()
+        self.size_px = self._given_px
+        self.warnings, self.is_reshaped = [], True
+        return self
 
     def close(self) -> None:
         """End the iteration at the next image; a wait for a lost camera ends at once."""
@@ -172,10 +191,17 @@ class LiveSource(CameraSource):
     def _frames(self) -> Iterator[CameraFrame]:
         seq = 0
         last_ns = -1
+        odd_ns, odd_px = 0, self.size_px  # since when the images are of another shape
         for image, time_ns in itertools.chain((self._first,), self._endless()):
             fitting = self._fitted(image)
             if fitting is None:
+                if odd_px != self._given_px:
+                    odd_ns, odd_px = time_ns, self._given_px
+                if time_ns - odd_ns >= CHANGED_NS:
+                    self._next = image, time_ns
+                    return
                 continue
+            odd_px = self.size_px
             if time_ns > last_ns:
                 yield CameraFrame(fitting, time_ns, seq, None, f"frame {seq}")
                 seq += 1
@@ -266,7 +292,7 @@ class LiveSource(CameraSource):
             self._warn(
                 f"now gives {size_px[0]}x{size_px[1]} images instead of "
                 f"{self.size_px[0]}x{self.size_px[1]}; they are "
-                + ("scaled" if is_alike else "dropped: the camera model does not fit them")
+                + ("scaled" if is_alike else "dropped, and end this scan if they stay")
             )
         if not is_alike:
             self.misfits += 1

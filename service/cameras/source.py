@@ -92,6 +92,7 @@ class CameraSource(ABC):
     fps: float | None = None  # mean images per second, if known
     is_live = False  # images that are not fetched in time are lost
     turned_deg = 0  # clockwise, from the images as they are stored
+    is_reshaped = False  # it follows a source whose images had another shape
 
     def __init__(self, description: str) -> None:
         self.description = description  # for a log line and scan.json
@@ -110,6 +111,11 @@ class CameraSource(ABC):
     def dropped(self) -> int:
         """Images that were not fetched in time."""
         return 0
+
+    def following(self) -> CameraSource | None:
+        """The camera's further images where a change of their shape has ended this source, else
+        None; what this source holds open is then the other's."""
+        return None
 
     def close(self) -> None:  # noqa: B027, most recordings hold nothing open
         """Release the file or device; safe to call twice."""
@@ -184,6 +190,8 @@ class Paced(Relayed):
         self._closed = Event()
         self._starting = Lock()
         self._reader: Worker | None = None
+        self._is_passed_on = False
+        self.is_reshaped = source.is_reshaped
 
     @property
     def dropped(self) -> int:
@@ -194,13 +202,22 @@ class Paced(Relayed):
 
         def end() -> None:
             due.close()
-            self._source.close()
+            if not self._source.is_live:
+                self._source.close()
 
         with self._starting:  # close() finds the reader, or the reader finds it closed
             self._reader = _read("camera", self._queue, due, end)
         yield from self._queue
         if self.dropped:
             self.warnings.append(f"{self.dropped} frames arrived faster than they could be used")
+
+    def following(self) -> CameraSource | None:
+        if self._reader is None or not self._source.is_live:
+            return None
+        self._reader.join()  # it ends with its queue
+        source = self._source.following()
+        self._is_passed_on = source is not None
+        return source and Paced(source)
 
     def close(self) -> None:
         """End the iteration at once, from any thread, and close the source.
@@ -212,6 +229,8 @@ class Paced(Relayed):
         self._queue.close()
         with self._starting:
             reader = self._reader
+        if self._is_passed_on:
+            return
         if self._source.is_live or reader is None:
             self._source.close()
         else:

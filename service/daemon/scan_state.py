@@ -61,7 +61,7 @@ class Event(Enum):
     TICK = "due"  # time passes; counts once the next attempt is due
     GROWN = "grown"  # the attempt has stored data
     COMPLETED = "completed"  # the recording has ended by itself
-    INTERRUPTED = "interrupted"  # a fault; what is stored is being closed
+    INTERRUPTED = "interrupted"  # a fault, or images of another shape; the scan is being closed
     DONE = "done"  # the attempt has ended
     FAILED = "failed"  # the attempt has ended by a fault
     END = "end"  # the service ends

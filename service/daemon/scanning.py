@@ -96,6 +96,7 @@ class Scanning:
         self._runs: list[ScanRun] = []  # those whose workers run, the newest last
         self._marks: list[Any] | None = None  # of the closing, as seen last
         self._marked_s = 0.0  # when they changed
+        self._following: CameraSource | None = None  # the camera, open, for the next run
 
     def load(self) -> None:
         """Load camera model and backend, which takes long; InputError if they are unusable."""
@@ -124,9 +125,16 @@ class Scanning:
             scan = self.scan
             if event is Event.GROWN:
                 self.is_warm = True
+            unused = None if self.life.state.is_wanted else self._take_following()
         if Effect.CLOSE in effects and scan is not None:
             scan.source.close()  # wakes it where the camera is dead; may take long
+        if unused is not None:
+            unused.close()
         return before
+
+    def _take_following(self) -> CameraSource | None:
+        following, self._following = self._following, None
+        return following
 
     def _perform(self, effect: Effect) -> None:
         match effect:
@@ -302,6 +310,10 @@ class Scanning:
         from service.cameras import open_camera
         from service.cameras.source import Paced
 
+        with self._lock:
+            following = self._take_following()
+        if following is not None:
+            return following
         wait_s, is_answer = FIRST_RETRY_S, run.is_asked
         while not run.stop.is_set():
             began_s = time.monotonic()
@@ -339,7 +351,7 @@ class Scanning:
             self._apply()  # what was configured since
         vehicle.statustext(f"Scan {inputs.scan_id} started")
         try:
-            self._feed(run, scan)
+            self._feed(run, scan, source)
         finally:
             source.close()
             vehicle.record(None)
@@ -393,8 +405,9 @@ class Scanning:
         )
         return inputs, gate
 
-    def _feed(self, run: ScanRun, scan: Scan) -> None:
-        """Feed frames into the scan until it is stopped or the recording ends."""
+    def _feed(self, run: ScanRun, scan: Scan, source: CameraSource) -> None:
+        """Feed frames into the scan until it is stopped, the recording ends or the images change
+        their shape: another scan follows then."""
 
         def on_frame(_: Scan) -> None:
             run.alive()
@@ -405,7 +418,10 @@ class Scanning:
         event, run.is_feeding = Event.INTERRUPTED, True
         try:
             scan.run(run.stop, on_frame, self.paused)
-            event = Event.COMPLETED
+            with self._lock:
+                if not run.stop.is_set():
+                    self._following = source.following()
+            event = Event.COMPLETED if self._following is None else Event.INTERRUPTED
         finally:
             run.is_feeding = False
             self.handle(event)

@@ -23,6 +23,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from live_stream import RealTime, clip, opener
 from loopback import free_port, until
 
 from service.cameras import CameraFrame, CameraSource, live, open_camera
@@ -35,56 +36,6 @@ from service.workers import PROCESS, Worker
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
 QUICK = LiveConfig(stall_s=1.0, frozen_s=0.3, first_retry_s=0.01, longest_retry_s=0.05)
-
-
-def clip(n: int, size_px: tuple[int, int] = (64, 48), moving: bool = True) -> bytes:
-    """``n`` Matroska images of noise, 20 ms apart; all the same unless ``moving``."""
-    data = io.BytesIO()
-    with av.open(data, "w", format="matroska") as out:
-        stream: Any = out.add_stream("ffv1", rate=50)
-        stream.width, stream.height = size_px
-        stream.pix_fmt = "yuv420p"
-        for i in range(n):
-            noise = np.random.default_rng(i if moving else 0)
-            image = noise.integers(0, 256, (size_px[1], size_px[0], 3), np.uint8)
-            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
-            frame.pts, frame.time_base = i, Fraction(1, 50)
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode(None))
-    return data.getvalue()
-
-
-def opener(*connections: bytes | Exception) -> Callable[[float], Any]:
-    """An opener that gives one connection after the other, the last one again and again."""
-    left = list(connections)
-
-    def open_container(stall_s: float) -> Any:
-        found = left.pop(0) if len(left) > 1 else left[0]
-        if isinstance(found, Exception):
-            raise found
-        return RealTime(av.open(io.BytesIO(found)))
-
-    return open_container
-
-
-class RealTime:
-    """A container whose packets come when they are due, 20 ms apart."""
-
-    def __init__(self, container: Any) -> None:
-        self.streams, self.flags = container.streams, container.flags
-        self._container = container
-        self.is_open = True
-
-    def demux(self, stream: Any) -> Iterator[Any]:
-        due = time.monotonic()
-        for packet in self._container.demux(stream):
-            time.sleep(max(0.0, due - time.monotonic()))
-            due += 0.02
-            yield packet
-
-    def close(self) -> None:
-        self.is_open = False
-        self._container.close()
 
 
 class Waiting:
@@ -341,7 +292,7 @@ def test_an_image_larger_than_the_demuxers_packets_is_whole() -> None:
     assert units == images
 
 
-def take(source: LiveSource, n: int) -> list[CameraFrame]:
+def take(source: CameraSource, n: int) -> list[CameraFrame]:
     frames = []
     for frame in source:
         frames.append(frame)
@@ -425,6 +376,43 @@ def test_images_of_another_size_are_scaled_and_of_another_shape_dropped() -> Non
     assert 0 < source.misfits <= 4  # the first of a connection has no time
     assert any("96x64" in w and "dropped" in w for w in source.warnings)
     assert any("128x96" in w and "scaled" in w for w in source.warnings)
+    assert source.following() is None
+
+
+def test_a_shape_that_stays_is_another_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The connection stays: a sender that is cut off may not come again."""
+    monkeypatch.setattr(live, "CHANGED_NS", 200_000_000)
+    source = LiveSource(opener(clip(10), clip(200, (96, 64))), "test", QUICK)
+    paced = Paced(source)
+    assert {frame.image.shape for frame in paced} == {(48, 64, 3)}
+    began_ns, losses = source.start_monotonic_ns, source.losses
+    following = paced.following()
+    assert following is not None and following.is_live and following.is_reshaped
+    paced.close()
+    assert (following.size_px, following.warnings) == ((96, 64), [])
+    assert following.start_monotonic_ns is not None and began_ns is not None
+    assert following.start_monotonic_ns > began_ns
+    frames = take(following, 10)
+    assert {frame.image.shape for frame in frames} == {(64, 96, 3)}
+    assert frames[0].time_ns == 0 and frames[0].seq == 0
+    assert 0 < frames[-1].time_ns < 2_000_000_000
+    assert source.losses == losses
+
+
+def test_a_source_that_nothing_follows_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "CHANGED_NS", 0)
+    opened = list[RealTime]()
+
+    def open_container(stall_s: float) -> Any:
+        opened.append(RealTime(av.open(io.BytesIO(clip(5, (96, 64) if opened else (64, 48))))))
+        return opened[-1]
+
+    paced = Paced(LiveSource(open_container, "test", QUICK))
+    assert len(list(paced)) > 0
+    assert [one.is_open for one in opened] == [False, True]
+    paced.close()
+    assert not opened[-1].is_open
+    assert paced.following() is None
 
 
 def test_frozen_image_is_found_out() -> None:

@@ -18,10 +18,11 @@ from typer.testing import CliRunner
 
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog
+from recon.camera_model import rays
 from recon.types import F64, U8, Camera
 from service.cameras import open_camera
 from service.cameras.exif import read_tags
-from service.cameras.lens import SIGMA_FOCAL, Lens, by_view, fitted, turned
+from service.cameras.lens import SIGMA_FOCAL, Lens, by_view, fitted, reshaped, turned
 from service.cameras.source import CameraSource
 from service.cli import app
 from service.commands.missing_metadata import start_lens
@@ -195,7 +196,8 @@ def test_a_turned_camera_sees_the_same(clockwise_deg: int) -> None:
 
 def images(size_px: tuple[int, int], turned_deg: int = 0) -> Any:
     """A source of images of this size."""
-    return Mock(CameraSource, size_px=size_px, turned_deg=turned_deg, description="gimbal")
+    given = {"size_px": size_px, "turned_deg": turned_deg, "is_reshaped": False}
+    return Mock(CameraSource, description="gimbal", **given)
 
 
 def test_a_model_of_another_size_is_scaled_and_of_another_shape_refused() -> None:
@@ -209,6 +211,23 @@ def test_a_model_of_another_size_is_scaled_and_of_another_shape_refused() -> Non
     for refused in (images((1600, 900)), images((1200, 1600))):
         with pytest.raises(InputError, match="4000x3000 images, gimbal has 1"):
             fitted(camera, refused)
+
+
+def test_the_model_of_another_shape_sees_as_much_along_the_longer_side() -> None:
+    """16:9 of a 4:3 sensor is the rows in its middle; upright images are of a camera turned."""
+    camera = Lens(0.75, (0.01, -0.02), (0.1, 0.02, 0.0, 0.0, 0.0)).camera((4000, 3000))
+    wide = reshaped(camera, (1280, 720))
+    assert wide.size_px == (1280, 720) and wide.sigma_focal == 0.15
+    px = np.array([[0.0, 1500.0], [3999.0, 900.0], [2100.0, 2000.0]])
+    shown = 0.32 * (px + 0.5) - 0.5 - (0.0, 120.0)  # of 960 rows, 120 are cut off above
+    assert np.allclose(rays(camera.K, px), rays(wide.K, shown))
+    upright = reshaped(camera, (1500, 2000))
+    assert upright.size_px == (1500, 2000) and upright.sigma_focal == camera.sigma_focal
+    assert upright.K[1, 1] == pytest.approx(1500.0)
+    source = images((1280, 720))
+    source.is_reshaped = True
+    model, notes = fitted(camera, source)
+    assert np.array_equal(model.K, wide.K) and "that of 1280x720 is derived" in notes[0]
 
 
 def upper_left(image: U8) -> bool:

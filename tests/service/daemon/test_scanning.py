@@ -6,21 +6,27 @@ import gc
 import os
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
+from live_stream import clip, opener
 from loopback import until
 from onboard import FakeCamera, Onboard, camera_of
 
 from mavlink.component.control import Phase
-from service.cameras.source import CameraFrame
+from service.cameras import live
+from service.cameras.live import LiveSource
+from service.cameras.source import CameraFrame, Paced
 from service.daemon.frame_gate import FrameGate
 from service.daemon.resumption import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import Event, State
+from service.daemon.scanning import Scanning
 from service.flight.scan import short_collections
+from service.stream.store import ScanStore
 from service.workers import Worker, Workers
 
 
@@ -71,6 +77,65 @@ def test_a_camera_model_of_another_size_is_scaled_as_by_a_replay(tmp_path: Path)
     assert inputs.notes == (note,)
     scanning.end()
     assert scanning.fault == "" and note in daemon.vehicle.said
+
+
+def test_another_shape_of_a_live_stream_begins_another_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first scan ends as one whose recording has ended; the camera is not opened again."""
+    monkeypatch.setattr(live, "CHANGED_NS", 200_000_000)
+    opened: list[str] = []
+
+    def open_camera(source: str) -> Paced:
+        opened.append(source)
+        parts = clip(20, (320, 240)), clip(20, (320, 180)), clip(1000, (160, 90))
+        return Paced(LiveSource(opener(*parts), "gimbal"))
+
+    daemon = Onboard(tmp_path, "camera.source=srt://:9000", opener=open_camera)
+    scanning, said = daemon.scanning, daemon.vehicle.said
+    daemon.equip()
+    scanning.start()
+    first = until(lambda: scanning.scan)
+    until(lambda: scanning.handle(Event.TICK) and scanning.scan not in (None, first))
+    second = scanning.scan
+    assert second is not None and first.inputs.camera.size_px == (320, 240)
+    until(lambda: second.recorder.frames > 20)  # and the smaller ones of that shape are in it
+    model, given = second.inputs.camera, scanning.camera
+    assert given is not None and model.size_px == (320, 180)
+    assert model.K[0, 0] == pytest.approx(given.K[0, 0] / 5) and model.sigma_focal == 0.15
+    scanning.end()
+    assert opened == ["srt://:9000"] and scanning.fault == ""
+    assert any("that of 320x180 is derived" in text for text in said)
+    scans = sorted(path.parent for path in tmp_path.glob("2*/scan.json"))
+    warned = {240: "now gives 320x180 images instead of 320x240", 180: "they are scaled"}
+    for folder, height in zip(scans, warned, strict=True):
+        with closing(ScanStore.open(folder / "scan.db")) as store:
+            summary = store.summary or {}
+            assert store.header.camera["height"] == height
+            assert warned[height] in " ".join(summary["warnings"]) and "interrupted" not in summary
+
+
+def test_a_stop_closes_the_camera_that_the_next_scan_would_take(tmp_path: Path) -> None:
+    class Reshaped(FakeCamera):
+        def following(self) -> FakeCamera:
+            return left
+
+    left, go = FakeCamera((320, 180)), threading.Event()
+
+    class Slow(Scanning):
+        def _close_scan(self, *given: Any) -> None:
+            go.wait(60.0)
+            super()._close_scan(*given)
+
+    daemon = Onboard(tmp_path, opener=camera_of(Reshaped((1600, 1200))), of=Slow)
+    daemon.equip()
+    daemon.scanning.start()
+    until(lambda: daemon.scanning.life.state is State.REOPENING)
+    assert not left.closed.is_set()
+    daemon.scanning.handle(Event.STOP)
+    assert left.closed.is_set()
+    go.set()
+    until(lambda: daemon.scanning.life.state is State.IDLE)
 
 
 def test_a_scan_that_was_stopped_counts_as_closing_at_once(tmp_path: Path) -> None:
