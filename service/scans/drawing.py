@@ -311,18 +311,19 @@ PANEL_PX = 480
 COLUMNS = 3
 TITLE_PX = 26
 GAP_PX = 10
-DEBUG_KEYS = {
-    "raw_left": 3,
-    "raw_right": 3,
-    "rect_left": 2,
-    "rect_right": 2,
-    "disparity": 2,
-    "upsampled": 2,
-    "depth_m": 2,
-    "sigma_m": 2,
-    "bgr": 3,
+STAGES: dict[str, tuple[int, str, tuple[str, int] | None]] = {
+    "raw_left": (3, "raw, left", None),
+    "raw_right": (3, "raw, right", None),
+    "rect_left": (2, "rectified, left", None),
+    "rect_right": (2, "rectified, right", None),
+    "disparity": (2, "belief propagation, label", ("px", cv2.COLORMAP_TURBO)),
+    "upsampled": (2, "upsampled, label", ("px", cv2.COLORMAP_TURBO)),
+    "depth_m": (2, "depth", ("m", cv2.COLORMAP_TURBO)),
+    "sigma_m": (2, "sigma", ("m", cv2.COLORMAP_MAGMA)),
+    "bgr": (3, "colour of the points", None),
 }
-"""Contents of ``debug/keyframe_NNNNNN.npz``, and the number of dimensions of each array."""
+"""Contents of ``debug/keyframe_NNNNNN.npz`` in the order of the paper's figure: dimensions of each
+array, title, and the unit and colours of what is no image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -338,16 +339,16 @@ def debug_path(folder: Path, seq: int) -> Path:
 
 
 def save_debug(folder: Path, seq: int, arrays: Mapping[str, Array]) -> Path:
-    """Save the stages of a keyframe for ``skyrelief inspect``, which reads those of DEBUG_KEYS."""
+    """Save the stages of a keyframe for ``skyrelief inspect``, which reads those of STAGES."""
     path = debug_path(folder, seq)
     path.parent.mkdir(parents=True, exist_ok=True)
-    kept: dict[str, Any] = {name: arrays[name] for name in DEBUG_KEYS if name in arrays}
+    kept: dict[str, Any] = {name: arrays[name] for name in STAGES if name in arrays}
     np.savez_compressed(path, **kept)
     return path
 
 
 def load_debug(path: Path) -> dict[str, Array] | None:
-    """The arrays of DEBUG_KEYS in ``path``; None when there is no such file.
+    """The arrays of STAGES in ``path``; None when there is no such file.
 
     Raises InputError when the file was not written by ``save_debug``.
     """
@@ -355,7 +356,7 @@ def load_debug(path: Path) -> dict[str, Array] | None:
         return None
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays: dict[str, Array] = {k: file[k] for k in DEBUG_KEYS if k in file.files}
+            arrays: dict[str, Array] = {k: file[k] for k in STAGES if k in file.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(
             f"{path} cannot be read ({error}); replay with keep_debug again"
@@ -363,7 +364,7 @@ def load_debug(path: Path) -> dict[str, Array] | None:
     for name, array in arrays.items():
         gray = name.startswith("raw") and array.ndim == 2  # a drone without colour
         if (
-            (array.ndim != DEBUG_KEYS[name] and not gray)
+            (array.ndim != STAGES[name][0] and not gray)
             or array.dtype.kind not in "fu"
             or not array.size
         ):
@@ -393,28 +394,15 @@ def stages(folder: Path, scan_id: str, keyframe: Keyframe) -> tuple[U8, bool]:
 
 
 def debug_panels(arrays: dict[str, Array]) -> list[Panel]:
-    """The stages in the order of the paper's figure; stages that were not saved are left out."""
+    """The stages and the anaglyph; stages that were not saved are left out."""
     out = []
-    for name, title in (
-        ("raw_left", "raw, left"), ("raw_right", "raw, right"),
-        ("rect_left", "rectified, left"), ("rect_right", "rectified, right"),
-    ):  # fmt: skip
-        if name in arrays:
-            out.append(Panel(title, _bgr(arrays[name])))
-    if "rect_left" in arrays and "rect_right" in arrays:
-        out.append(Panel("anaglyph", anaglyph(arrays["rect_left"], arrays["rect_right"])))
-    for name, title in (
-        ("disparity", "belief propagation, label"),
-        ("upsampled", "upsampled, label"),
-    ):
-        if name in arrays:
-            out.append(coloured(title, arrays[name], "px"))
-    if "depth_m" in arrays:
-        out.append(coloured("depth", arrays["depth_m"], "m"))
-    if "sigma_m" in arrays:
-        out.append(coloured("sigma", arrays["sigma_m"], "m", cv2.COLORMAP_MAGMA))
-    if "bgr" in arrays:
-        out.append(Panel("colour of the points", _bgr(arrays["bgr"])))
+    for name, (_, title, scale) in STAGES.items():
+        if name not in arrays:
+            continue
+        image = arrays[name]
+        out.append(Panel(title, _bgr(image)) if scale is None else coloured(title, image, *scale))
+        if name == "rect_right" and "rect_left" in arrays:
+            out.append(Panel("anaglyph", anaglyph(arrays["rect_left"], image)))
     return out
 
 

@@ -172,18 +172,11 @@ def _base(c: Any, k: Any, i: int, row: int, last: Any) -> Any:
 @numba.njit(cache=True, nogil=True, inline="always")
 def _guess(c: I64, k: I64, i: int, row: int, base: int, w: I64) -> Any:
     """The prediction of pixel ``i``, 0 to 65535."""
-    sum_ = (
-        w[0] * (c[i - row] - base) * k[i - row]
-        + w[1] * (c[i - row - 1] - base) * k[i - row - 1]
-        + w[2] * (c[i - row + 1] - base) * k[i - row + 1]
-        + w[3] * (c[i - 2] - base) * k[i - 2]
-        + w[4] * (c[i - 2 * row] - base) * k[i - 2 * row]
-        + w[5] * (c[i - 2 * row - 1] - base) * k[i - 2 * row - 1]
-        + w[6] * (c[i - 2 * row + 1] - base) * k[i - 2 * row + 1]
-        + w[7] * (c[i - row + 2] - base) * k[i - row + 2]
-        + w[8] * (c[i - row - 2] - base) * k[i - row - 2]
-    )
-    return min(max(base + ((sum_ + (1 << (SHIFT - 1))) >> SHIFT), 0), 65535)
+    total = 1 << (SHIFT - 1)
+    for j in range(WEIGHTS):
+        at = i + NEIGHBOURS[j + 1, 0] * row + NEIGHBOURS[j + 1, 1]
+        total += w[j] * (c[at] - base) * k[at]
+    return min(max(base + (total >> SHIFT), 0), 65535)
 
 
 @numba.njit(cache=True, nogil=True)

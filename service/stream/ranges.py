@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import zlib
 from array import array
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Iterator
-from itertools import chain
 from typing import Any
+
+import numpy as np
 
 from service.stream.codec import IMAGE_LAYER
 from service.stream.database import Database
@@ -32,73 +33,58 @@ def chunk_kind(layer: int) -> str:
 class RangeSet:
     """A set of numbers up to :data:`MAX_NUMBER`, as sorted ranges that neither overlap nor touch.
 
-    Eight bytes each: a scan of hours has one for every keyframe.
+    Sixteen bytes each: a scan of hours has one for every keyframe.
     """
 
-    __slots__ = ("_firsts", "_lasts")
+    __slots__ = ("_edges",)
 
     def __init__(self, pairs: Iterable[tuple[int, int]] = ()) -> None:
-        self._firsts, self._lasts = array("I"), array("I")
+        self._edges = array("Q")  # of each range its first number, and the one after its last
         for first, last in sorted(pairs):
-            if self._lasts and first <= self._lasts[-1] + 1:
-                self._lasts[-1] = max(last, self._lasts[-1])
+            if self._edges and first <= self._edges[-1]:
+                self._edges[-1] = max(last + 1, self._edges[-1])
             else:
-                self._firsts.append(first)
-                self._lasts.append(last)
+                self._edges.extend((first, last + 1))
 
     @classmethod
     def of(cls, numbers: Iterable[int]) -> RangeSet:
         return cls((n, n) for n in numbers)
 
     def add(self, number: int) -> None:
-        at = bisect_right(self._firsts, number)
-        if at and self._lasts[at - 1] >= number:
-            return
-        touches_before = at > 0 and self._lasts[at - 1] == number - 1
-        touches_after = at < len(self._firsts) and self._firsts[at] == number + 1
-        if touches_before and touches_after:
-            self._lasts[at - 1] = self._lasts.pop(at)
-            self._firsts.pop(at)
-        elif touches_before:
-            self._lasts[at - 1] = number
-        elif touches_after:
-            self._firsts[at] = number
-        else:
-            self._firsts.insert(at, number)
-            self._lasts.insert(at, number)
+        if number not in self:
+            self._flip(number)
 
     def discard(self, number: int) -> None:
         """Remove ``number`` if present."""
-        at = bisect_right(self._firsts, number) - 1
-        if at < 0 or self._lasts[at] < number:
-            return
-        first, last = self._firsts[at], self._lasts[at]
-        rest = [(a, b) for a, b in ((first, number - 1), (number + 1, last)) if a <= b]
-        self._firsts[at : at + 1] = array("I", [a for a, _ in rest])
-        self._lasts[at : at + 1] = array("I", [b for _, b in rest])
+        if number in self:
+            self._flip(number)
+
+    def _flip(self, number: int) -> None:
+        """Both edges of a number come or go, whether it is added or removed."""
+        for edge in (number, number + 1):
+            at = bisect_left(self._edges, edge)
+            if at < len(self._edges) and self._edges[at] == edge:
+                self._edges.pop(at)
+            else:
+                self._edges.insert(at, edge)
 
     def __contains__(self, number: int) -> bool:
-        at = bisect_right(self._firsts, number)
-        return at > 0 and self._lasts[at - 1] >= number
+        return bisect_right(self._edges, number) % 2 == 1
 
     def __len__(self) -> int:
-        return sum(self._lasts) - sum(self._firsts) + len(self._firsts)
+        return sum(self._edges[1::2]) - sum(self._edges[::2])
 
     def __bool__(self) -> bool:
-        return bool(self._firsts)
+        return bool(self._edges)
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, RangeSet)
-            and self._firsts == other._firsts
-            and self._lasts == other._lasts
-        )
+        return isinstance(other, RangeSet) and self._edges == other._edges
 
     def __repr__(self) -> str:
-        return f"RangeSet({list(self._ranges())})"
+        return f"RangeSet({self._ranges()})"
 
-    def _ranges(self) -> Iterator[tuple[int, int]]:
-        return zip(self._firsts, self._lasts, strict=True)
+    def _ranges(self) -> Pairs:
+        return [(a, b - 1) for a, b in zip(self._edges[::2], self._edges[1::2], strict=True)]
 
     def __iter__(self) -> Iterator[int]:
         for first, last in self._ranges():
@@ -106,51 +92,35 @@ class RangeSet:
 
     def newest_first(self) -> Iterator[int]:
         """The numbers, largest first."""
-        for first, last in zip(reversed(self._firsts), reversed(self._lasts), strict=True):
+        for first, last in reversed(self._ranges()):
             yield from range(last, first - 1, -1)
 
     def __sub__(self, other: RangeSet) -> RangeSet:
         """The numbers that are not in ``other``."""
+        edges = np.union1d(self._edges, other._edges)
+        own, taken = (np.searchsorted(s._edges, edges, "right") % 2 for s in (self, other))
         out = RangeSet()
-        taken = chain(other._ranges(), [(MAX_NUMBER + 2, MAX_NUMBER + 2)])
-        a, b = next(taken)
-        for low, last in self._ranges():
-            first = low
-            while b < first:
-                a, b = next(taken)
-            while a <= last:
-                if first < a:
-                    out._put(first, a - 1)
-                first = b + 1
-                if b > last:
-                    break
-                a, b = next(taken)
-            if first <= last:
-                out._put(first, last)
+        out._edges.frombytes(edges[np.diff(own > taken, prepend=False)].tobytes())
         return out
-
-    def _put(self, first: int, last: int) -> None:
-        self._firsts.append(first)
-        self._lasts.append(last)
 
     @property
     def last(self) -> int:
         """The largest number; -1 for none."""
-        return self._lasts[-1] if self._lasts else -1
+        return self._edges[-1] - 1 if self._edges else -1
 
     def copy(self) -> RangeSet:
         same = RangeSet()
-        same._firsts, same._lasts = self._firsts[:], self._lasts[:]
+        same._edges = self._edges[:]
         return same
 
     @property
     def range_count(self) -> int:
         """Number of ranges: the cost of storing or comparing the set."""
-        return len(self._firsts)
+        return len(self._edges) // 2
 
     def pairs(self) -> Pairs:
         """The ranges (first, last), in order; at most the newest MAX_RANGES."""
-        return list(zip(self._firsts[-MAX_RANGES:], self._lasts[-MAX_RANGES:], strict=True))
+        return self._ranges()[-MAX_RANGES:]
 
     def text(self) -> str:
         """The ranges as ``1-5,7``, for a key expression."""

@@ -16,7 +16,7 @@ from recon.types import Array, DepthMap, Keyframe
 from service.cli import app
 from service.errors import InputError
 from service.scans.drawing import (
-    DEBUG_KEYS,
+    STAGES,
     anaglyph,
     coloured,
     debug_panels,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def stages() -> dict[str, Array]:
     rng = np.random.default_rng(0)
     out: dict[str, Array] = {}
-    for name, dims in DEBUG_KEYS.items():
+    for name, (dims, *_) in STAGES.items():
         if dims == 3:
             out[name] = rng.integers(0, 255, (72, 128, 3), dtype=np.uint8)
         elif name.startswith("rect"):
@@ -51,7 +51,7 @@ def test_kept_stages_come_back_and_each_has_its_panel(tmp_path: Path) -> None:
     assert save_debug(tmp_path, 7, kept | {"other": np.zeros(3)}) == debug_path(tmp_path, 7)
     arrays = load_debug(debug_path(tmp_path, 7))
     assert arrays is not None
-    assert set(arrays) == set(DEBUG_KEYS)
+    assert set(arrays) == set(STAGES)
     np.testing.assert_array_equal(arrays["depth_m"], kept["depth_m"])
     panels = debug_panels(arrays)
     assert [p.title.split(",")[0].split(" ")[0] for p in panels] == [
