@@ -211,7 +211,7 @@ class Smoother:
     """Poses by key 0, 1, 2 ...; scales by key from 1 on, :data:`NO_SCALE` before them."""
 
     def __init__(self) -> None:
-        self._factors: dict[str, Factors] = {}
+        self.factors: dict[str, Factors] = {}
         self._held = System.of([], State(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(1)))
         self._waiting: list[tuple[F64, F64]] = []  # pose and its left covariance
         self._fresh_logs: list[float] = []
@@ -256,9 +256,9 @@ class Smoother:
         row: tuple[Any, ...], huber: float = np.inf, cauchy: float = np.inf,
     ) -> None:  # fmt: skip
         """A factor of any form; all of one kind share a loss (:class:`Factors`)."""
-        if kind not in self._factors:
-            self._factors[kind] = Factors(form, dtype, huber, cauchy)
-        self._factors[kind].table.append(np.array([row], dtype))
+        if kind not in self.factors:
+            self.factors[kind] = Factors(form, dtype, huber, cauchy)
+        self.factors[kind].table.append(np.array([row], dtype))
 
     def append_pose(self, T: F64, covariance: F64) -> None:
         """The next pose (4, 4) with its predicted left covariance (6, 6)."""
@@ -283,7 +283,7 @@ class Smoother:
             np.concatenate([held.t, T[:, :3, 3]]),
             np.concatenate([held.logs, self._fresh_logs]),
         )
-        self._held = solved(list(self._factors.values()), start, steps)
+        self._held = solved(list(self.factors.values()), start, steps)
         self._waiting, self._fresh_logs = [], []
         self._covariances.clear()
         self.updates += 1
@@ -326,7 +326,7 @@ class Smoother:
         """
         if self._waiting:
             return {}
-        return {kind: one.about(self._held.at)[0] for kind, one in self._factors.items()}
+        return {kind: one.about(self._held.at)[0] for kind, one in self.factors.items()}
 
 
 def left_covariance(T: F64, covariance: F64) -> F64:

@@ -99,8 +99,8 @@ def matching_cost(
     check_pair(left, right, labels)
     height, width = left.shape
     cells = cells_of(width)
-    above = _space.take_bytes("above", (height, 2, labels, cells))
-    least = _space.take_bytes("least", (height, 2, cells))
+    above = WORKSPACE.take_bytes("above", (height, 2, labels, cells))
+    least = WORKSPACE.take_bytes("least", (height, 2, cells))
     parallel_for(
         _cost_volume, height, columns_apart(left), columns_apart(right), width,
         min_disparity, (*config.integers, np.uint8(most)), above, least, cells=above.size,
@@ -310,4 +310,4 @@ class Workspace(threading.local):
         return self.take(name, ((size + 1) // 2,)).view(np.uint8)[:size].reshape(shape)
 
 
-_space = Workspace()
+WORKSPACE = Workspace()

@@ -126,7 +126,7 @@ FULL_WEIGHT = 256
 UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
 """Where a message travels."""
 
-_space = Workspace()
+WORKSPACE = Workspace()
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +213,7 @@ def propagate(data: U8 | I16, weights: list[I16], iterations: int, smoothness: S
     _, height, width = weights[0].shape
     coarser = coarser_messages(data, weights, iterations, smoothness)
     edges = edges_of(weights[0], smoothness)
-    out = _space.take_bytes(f"messages {len(weights)}", (4, height + 2, *data.shape[1:]))
+    out = WORKSPACE.take_bytes(f"messages {len(weights)}", (4, height + 2, *data.shape[1:]))
 
     def sweep(begin: int, end: int) -> None:
         ring = out if end - begin == height else ring_of(data, iterations)
@@ -231,7 +231,7 @@ def coarser_messages(
         return np.zeros((4, 1, 2, data.shape[2], 1), np.uint8)
     _, height, width = weights[1].shape
     shape = (height, 2, data.shape[2], cells_of(width))
-    coarse = _space.take(f"data {len(weights)}", shape)
+    coarse = WORKSPACE.take(f"data {len(weights)}", shape)
     parallel_for(_coarser, height, data, width, smoothness.truncation, coarse, cells=data.size)
     return propagate(coarse, weights[1:], iterations, smoothness)
 
@@ -248,7 +248,7 @@ def ring_of(data: U8 | I16, iterations: int) -> U8:
     """Memory for the messages of as many rows as are in work at a time, or all of the image; a
     thread uses it again."""
     height, _, labels, cells = data.shape
-    return _space.take_bytes("ring", (4, min(iterations + 3, height + 2), 2, labels, cells))
+    return WORKSPACE.take_bytes("ring", (4, min(iterations + 3, height + 2), 2, labels, cells))
 
 
 @njit(cache=True, nogil=True)

@@ -316,7 +316,7 @@ def _fit_plane(u: F64, v: F64, d: F64) -> tuple[F64, F64]:
     return np.asarray(plane), np.asarray(d - A @ plane)
 
 
-def _homography(
+def homography(
     view: PosedImage, R_rect_view: F64, K: F64, oversample: float, plane: F64 | None
 ) -> F64:
     """(3, 3) from a pixel of the rectified image (``oversample`` finer) to one of the view.
@@ -344,7 +344,7 @@ def _warp(
     It is halved first until no pixel is skipped. Beyond the image its edge is repeated: a
     black rim would be matched with the other view's.
     """
-    M = _homography(view, R_rect_view, K, oversample, plane)
+    M = homography(view, R_rect_view, K, oversample, plane)
     ratio = float(view.K[0, 0]) / (K[0, 0] * oversample)
     fine = (int(size[0] * oversample), int(size[1] * oversample))
     return _sampled(halved(image, ratio), view, M, fine, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
@@ -402,7 +402,7 @@ def _stereo_view(
 ) -> tuple[U8, Bool]:
     """Gray rectified view (h, w), averaged down from twice its size, and where it shows something,
     a pixel inside the border."""
-    M, inside = _homography(view, R_rect_view, K, 1.0, plane), view.inside(K[0, 0])
+    M, inside = homography(view, R_rect_view, K, 1.0, plane), view.inside(K[0, 0])
     seen = _sampled(inside, view, M, size, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
     double = _warp(view.gray, view, R_rect_view, K, size, 2.0, plane)
     gray = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -236,7 +236,7 @@ def checked_warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Search:
+class Search:
     """One direction of matching: patches about the points of image a, looked for in image b."""
 
     a: tuple[U8, ...]
@@ -318,11 +318,11 @@ def match(
     """
     a, predicted = checked_points(uv_a), checked_points(uv_b_predicted)
     forward_warp, inverse_warp = checked_warps(warp, len(a))
-    forward = _Search(pyramid_a, pyramid_b, a, inverse_warp, config)
+    forward = Search(pyramid_a, pyramid_b, a, inverse_warp, config)
     everyone: Bool = np.abs(np.hstack([a, predicted])).max(axis=1, initial=0.0) < FAR
     uv, active, contrast = predicted, everyone, None
     if radius_px > 0:
-        back = _Search(pyramid_b, pyramid_a, predicted, forward_warp, config)
+        back = Search(pyramid_b, pyramid_a, predicted, forward_warp, config)
         uv, active, contrast = _coarse_to_fine(forward, back, predicted, everyone, radius_px)
     uv, score, contrast_a, contrast_b = forward.refined(uv, active)
     ok = active & (2.0 * (1.0 - score) <= config.max_zssd)
@@ -330,7 +330,7 @@ def match(
     if contrast is not None:
         ok &= ~_repeats(forward, uv, ok, contrast, contrast_a)
     if np.isfinite(config.max_return_px):
-        back = _Search(pyramid_b, pyramid_a, uv, forward_warp, config)
+        back = Search(pyramid_b, pyramid_a, uv, forward_warp, config)
         home, alike, *_ = back.refined(a, ok)
         ok &= (alike > 0) & (np.linalg.norm(home - a, axis=1) <= config.max_return_px)
     uv = np.where(ok[:, None], uv, predicted)
@@ -368,7 +368,7 @@ def match_led(
 
 
 def _coarse_to_fine(
-    forward: _Search, back: _Search, predicted: F64, everyone: Bool, radius_px: float
+    forward: Search, back: Search, predicted: F64, everyone: Bool, radius_px: float
 ) -> tuple[F64, Bool, F64 | None]:
     """(N, 2) places in b to about a pixel, which (N,) take part, and the contrast (N,) on the level
     where the search began; None where that is the finest."""
@@ -412,7 +412,7 @@ def _follow_others(
     return np.where(own[:, None], uv, expected), everyone.copy()
 
 
-def _repeats(search: _Search, uv: F64, ok: Bool, coarse: F64, fine: F64) -> Bool:
+def _repeats(search: Search, uv: F64, ok: Bool, coarse: F64, fine: F64) -> Bool:
     """(N,) True for places in a texture that repeats.
 
     It may vanish on the coarse level, whose little contrast then decides by chance; such

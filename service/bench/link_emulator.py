@@ -64,7 +64,7 @@ class Traffic:
         return most
 
 
-class _Direction:
+class Direction:
     """One direction of the link: serialised at the rate, delayed, lost, cut."""
 
     def __init__(self, model: LinkModel, started: float, seed: int) -> None:
@@ -123,8 +123,8 @@ class LinkEmulator:
         self._model, self._clock = model, clock
         self._ports = listen_port, target_port
         self.started = clock()
-        self._up = _Direction(model, self.started, model.seed)
-        self._down = _Direction(model, self.started, model.seed + 1)
+        self._up = Direction(model, self.started, model.seed)
+        self._down = Direction(model, self.started, model.seed + 1)
         self.up = self._up.traffic
         self._loop = loop or asyncio.new_event_loop()
         self._ready = threading.Event()
@@ -173,7 +173,7 @@ class LinkEmulator:
         )
 
     async def _relay(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pipe: _Direction
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pipe: Direction
     ) -> None:
         """Carry one direction until its sender is done.
 

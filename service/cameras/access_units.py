@@ -60,7 +60,7 @@ def access_units(
     held: list[av.Packet[Any]] = []  # until the first packets show what they hold
     fed = cut = given = 0  # bytes from the stream's start: parsed, in whole images, passed on
     are_whole = True
-    packets = _headed(packets, parser.name)
+    packets = headed(packets, parser.name)
     for number, packet in enumerate(packets):  # the last one is empty, and empties the parser
         start, fed = fed, fed + packet.size
         begun.append((start, packet))
@@ -83,7 +83,7 @@ def access_units(
             held.clear()
 
 
-def _headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet[Any]]:
+def headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet[Any]]:
     """The packets, those that hold nothing of an image joined to the next one.
 
     Some senders give the parameter sets of a key frame a packet of their own.

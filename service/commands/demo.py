@@ -216,7 +216,7 @@ Scan onboard:         {onboard}
 Received at ground:   {ground}
   {report["points"]:,} points from {report["keyframes"]} keyframes over {report["area_m2"]:,.0f} m2,
   {report["distance_m"]:.0f} m flown, {report["seconds"]:.0f} s in all
-  {_verdict(report["quality"])}
+  {verdict(report["quality"])}
 Look at:
   {onboard}/preview.jpg   image: colour and relief from above
   {onboard}/report.html   map, accuracy and faults, in a browser
@@ -225,7 +225,7 @@ Look at:
                           the map in 3D, in a browser"""
 
 
-def _verdict(quality: dict[str, Any]) -> str:
+def verdict(quality: dict[str, Any]) -> str:
     """What may be measured, and one sigma of each, named as in the portal: what holds within the
     map first."""
     relative, scale = quality["sigma_median_m"], quality["scale_sigma"]

@@ -186,7 +186,7 @@ def _corrected(
     from service.commands.missing_metadata import Correction
 
     stop = stop_by_signals()
-    found = _fly(inputs, stop, progress, unsure)
+    found = fly(inputs, stop, progress, unsure)
     corrected = inputs
     while isinstance(found, Correction):
         progress(f"beginning again with the {found.of} that was found")
@@ -195,11 +195,11 @@ def _corrected(
         base = inputs if found.of == "clock" else corrected
         with closing(open_camera(video)) as again:
             corrected = replace(base, source=again, **found.changed)
-            found = _fly(corrected, stop, progress, unsure)
+            found = fly(corrected, stop, progress, unsure)
     return found
 
 
-def _fly(
+def fly(
     inputs: ScanInputs, stop: Event, progress: Progress, unsure: Collection[str]
 ) -> dict[str, Any] | Correction:
     """The scan's figures; or once the images correct something ``unsure``, the correction.

@@ -43,7 +43,7 @@ def run(config: ConfigFile = None, set_: Overrides = None) -> None:
 
     daemon = Daemon(chosen, first, fault)
     on_signals(daemon.quit, signal.SIGINT, signal.SIGTERM)
-    on_signals(lambda: _reload(daemon, flight, config, set_ or []), signal.SIGHUP)
+    on_signals(lambda: reread(daemon, flight, config, set_ or []), signal.SIGHUP)
     daemon.run()
 
 
@@ -88,7 +88,7 @@ def _first_beats(config: Config) -> FirstBeats | None:
     return first
 
 
-def _reload(
+def reread(
     daemon: Daemon, flight: SimulatedFlight | None, path: Path | None, overrides: list[str]
 ) -> None:
     """Read the configuration again, each signal after the one before: the newest file counts."""

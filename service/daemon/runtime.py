@@ -107,7 +107,7 @@ class Daemon:
             self._load(notifier)
             self.actions.is_ready = True
             notifier.ready()
-            PROCESS.every("housekeeping", HOUSEKEEPING_S, self._housekeeping)
+            PROCESS.every("housekeeping", HOUSEKEEPING_S, self.housekeeping)
             PROCESS.start("recover", lambda _: self.recover())
             self.watch(notifier)
         finally:
@@ -263,7 +263,7 @@ class Daemon:
             log.warning("%s: another service uses it; earlier scans are left unchanged", folder)
         self.scanning.offer_backlog()
 
-    def _housekeeping(self) -> None:
+    def housekeeping(self) -> None:
         """Monitor the machine, shed load, keep free space on the disk, and prepare for a scan."""
         if self._quit.is_set():
             return

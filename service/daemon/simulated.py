@@ -66,7 +66,7 @@ class SimulatedFlight:
         scan = config.scan
         if scan.start == "on-command":
             scan = replace(scan, start="on-boot")
-        if scan.folder == ScanConfig().folder and not _can_write(Path(scan.folder)):
+        if scan.folder == ScanConfig().folder and not can_write(Path(scan.folder)):
             scan = replace(scan, folder=str(self._state / "scans"))
         return replace(
             config,
@@ -126,7 +126,7 @@ def render_flight(folder: Path, given: dict[str, str]) -> None:
     recording.write(simulation, folder, report)
 
 
-def _can_write(folder: Path) -> bool:
+def can_write(folder: Path) -> bool:
     """True when the folder can be made and written to."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

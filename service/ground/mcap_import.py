@@ -241,7 +241,7 @@ MAX_RATIO, FREE_BYTES = 200, 1 << 20
 MAX_CHANNELS = 4096
 
 _DOUBLE, _FIXED32, _STRING, _MESSAGE, _BYTES = 1, 7, 9, 11, 12  # FieldDescriptorProto.Type
-_FIELDS: dict[str, list[tuple[str, int, int, str]]] = {
+FIELDS: dict[str, list[tuple[str, int, int, str]]] = {
     "Vector3": [("x", 1, _DOUBLE, ""), ("y", 2, _DOUBLE, ""), ("z", 3, _DOUBLE, "")],
     "Quaternion": [(axis, n + 1, _DOUBLE, "") for n, axis in enumerate("xyzw")],
     "Pose": [("position", 1, _MESSAGE, "Vector3"), ("orientation", 2, _MESSAGE, "Quaternion")],
@@ -287,7 +287,7 @@ def messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, An
                 schemas[record.id] = record.name.removeprefix("foxglove.")
             elif isinstance(record, Channel) and record.topic in topics:
                 name = schemas.get(record.schema_id, "")
-                if name in _FIELDS:
+                if name in FIELDS:
                     channels[record.id] = record.topic, name
             elif isinstance(record, Message) and record.channel_id in channels:
                 topic, name = channels[record.channel_id]
@@ -372,11 +372,11 @@ def _unpacked(chunk: Any) -> bytes:
 
 @cache
 def _classes() -> dict[str, Any]:
-    """Message classes of _FIELDS."""
+    """Message classes of FIELDS."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     file = descriptor_pb2.FileDescriptorProto(name="scan.proto", package="scan", syntax="proto3")
-    for name, fields in _FIELDS.items():
+    for name, fields in FIELDS.items():
         message = file.message_type.add(name=name)
         for field, number, kind, holds in fields:
             one = message.field.add(name=field, number=number, type=kind)
@@ -387,5 +387,5 @@ def _classes() -> dict[str, Any]:
     pool.Add(file)
     return {
         name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"scan.{name}"))
-        for name in _FIELDS
+        for name in FIELDS
     }

@@ -258,7 +258,7 @@ def write(
     parameters = _parameters(simulation, packet_count)
     (truth / "params.json").write_text(json.dumps(parameters, indent=2) + "\n")
     if options.with_video:
-        _write_video(simulation, folder / "flight.mp4", progress)
+        write_video(simulation, folder / "flight.mp4", progress)
     return parameters
 
 
@@ -313,7 +313,7 @@ def _parameters(simulation: Simulation, packet_count: int) -> dict[str, Any]:
     }
 
 
-def _write_video(
+def write_video(
     simulation: Simulation, path: Path, progress: Callable[[int, int], None] | None
 ) -> None:
     """H.264 in MP4 with a constant frame rate and the time of the first frame."""

@@ -9,13 +9,13 @@ from unittest.mock import Mock
 
 import pytest
 
-from service.bench.link_emulator import LinkEmulator, LinkModel, Traffic, _Direction
+from service.bench.link_emulator import Direction, LinkEmulator, LinkModel, Traffic
 
 WIRE = 1400 + 52
 
 
 def test_a_pipe_serialises_at_its_rate_and_delays() -> None:
-    pipe = _Direction(LinkModel(rate_kbit_s=1000.0, delay_s=0.05), 0.0, 1)
+    pipe = Direction(LinkModel(rate_kbit_s=1000.0, delay_s=0.05), 0.0, 1)
     out = [pipe.send(1400, 0.0) for _ in range(10)]
     for k, at in enumerate(out):
         assert at == pytest.approx((k + 1) * WIRE / 125_000 + 0.05)
@@ -24,7 +24,7 @@ def test_a_pipe_serialises_at_its_rate_and_delays() -> None:
 
 def test_a_cut_holds_a_stream_until_tcp_tries_again() -> None:
     model = LinkModel(rate_kbit_s=1000.0, delay_s=0.0, cuts=((1.0, 3.0),))
-    stream = _Direction(model, 0.0, 1)
+    stream = Direction(model, 0.0, 1)
     # Sent at 1.5 s, again after 0.2, 0.4, 0.8 and 1.6 s.
     assert stream.resumes(1.5, 0.2) == pytest.approx(1.5 + 0.2 + 0.4 + 0.8 + 1.6)
     assert stream.resumes(0.5, 0.2) == 0.5
@@ -32,7 +32,7 @@ def test_a_cut_holds_a_stream_until_tcp_tries_again() -> None:
 
 def test_loss_has_its_share_and_stalls_a_stream() -> None:
     model = LinkModel(rate_kbit_s=1e6, delay_s=0.1, loss=0.03)
-    stream = _Direction(model, 0.0, 7)
+    stream = Direction(model, 0.0, 7)
     late = [k for k in range(5000) if stream.send(100, float(k)) - k > 0.25]
     assert 100 < len(late) < 200
 

@@ -722,7 +722,7 @@ def test_the_gradient_is_the_costs_own(seed: int) -> None:
     smoother.add_place("position", 2, T[2][:3, 3] + 0.3, np.array([0.5, np.inf, 2.0]), 0.2)
     smoother.add_scale("scale", (NO_SCALE, scale), 0.2, 0.5)
     R, t = np.array(T)[:, :3, :3], np.array(T)[:, :3, 3]
-    at, factors = State(R, t, np.array([0.0, 0.1, -0.2])), list(smoother._factors.values())
+    at, factors = State(R, t, np.array([0.0, 0.1, -0.2])), list(smoother.factors.values())
     system = System.of(factors, at)
     for i in [*range(18), 19, 20]:  # 18 is the scale that is held
         step = np.zeros(len(system.g))

@@ -409,7 +409,7 @@ def test_the_finest_messages_are_never_kept() -> None:
 
     def held() -> int:
         belief_propagation(left, right, 20, BeliefPropagationConfig())
-        spaces = (message_passing._space, costs._space)
+        spaces = (message_passing.WORKSPACE, costs.WORKSPACE)
         return sum(a.nbytes for space in spaces for a in space._kept.values())
 
     with ThreadPoolExecutor(1) as pool:

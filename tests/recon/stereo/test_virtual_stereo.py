@@ -9,9 +9,9 @@ from recon import se3
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
 from recon.stereo.virtual_stereo import (
-    _homography,
     check_pair,
     drop_unseen,
+    homography,
     plane_relief,
     rectify,
 )
@@ -56,7 +56,7 @@ def test_every_point_has_its_partner_on_the_same_row(motion: tuple[float, float,
     T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
     R_rect_right = pair.R_left_keyframe @ T_left_right[:3, :3]
     h, w = pair.left.shape
-    M = _homography(right, R_rect_right, pair.K, 1.0, pair.plane)
+    M = homography(right, R_rect_right, pair.K, 1.0, pair.plane)
     x, y = u - label, v
     inside = (x > 1) & (x < w - 2) & (y > 1) & (y < h - 2)
     assert inside.sum() > 100

@@ -303,13 +303,13 @@ def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPa
 def test_a_few_landmarks_show_where_the_others_are(
     ground: U8, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at, searched = matching._Search.at, list[int]()
+    at, searched = matching.Search.at, list[int]()
 
     def counted(self: Any, level: int, uv_b: F64, active: Bool, reach: int) -> Any:
         searched[-1] += int(active.sum())
         return at(self, level, uv_b, active, reach)
 
-    monkeypatch.setattr(matching._Search, "at", counted)
+    monkeypatch.setattr(matching.Search, "at", counted)
     odometry, rng, out = Odometry(CAMERA), np.random.default_rng(2), list[Frame]()
     for i, T in enumerate(poses(20)):
         searched.append(0)

@@ -27,7 +27,7 @@ from live_stream import RealTime, clip, opener
 from loopback import free_port, until
 
 from service.cameras import CameraFrame, CameraSource, live, open_camera
-from service.cameras.access_units import LONGEST_HEAD, SURE, _headed, access_units
+from service.cameras.access_units import LONGEST_HEAD, SURE, access_units, headed
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.source import Paced
 from service.cameras.video import decoded_frames, video_stream
@@ -218,7 +218,7 @@ def test_packets_without_pictures_are_not_gathered_without_end() -> None:
         packets = [av.Packet(part) for part in parts]
         for packet in packets:
             packet.stream, packet.time_base = container.streams.video[0], Fraction(1, 10)
-        passed = [bytes(packet) for packet in _headed(iter(packets), "h264")]
+        passed = [bytes(packet) for packet in headed(iter(packets), "h264")]
     assert max(map(len, passed)) <= 2 * LONGEST_HEAD
     assert b"".join(parts).startswith(b"".join(passed)) and len(passed) == 2
 

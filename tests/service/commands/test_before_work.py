@@ -61,7 +61,7 @@ def test_a_stopped_simulation_leaves_nothing(
     def stopped(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("service.sim.recording._write_video", stopped)
+    monkeypatch.setattr("service.sim.recording.write_video", stopped)
     few = ("--duration-s", "1", "--fps", "1", "--size", "64x64", "--density", "0")
     skyrelief("simulate", "--out", tmp_path / "flight", *few)
     assert list(tmp_path.iterdir()) == []
@@ -118,7 +118,7 @@ def test_a_fault_in_one_product_ends_no_other(
     def faulty(*_: Any) -> None:
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("service.offline.exports.flight._geodetic", faulty)
+    monkeypatch.setattr("service.offline.exports.flight.line_geometry", faulty)
     out = tmp_path / "maps"
     ended = skyrelief("export", scan, "--to", "geojson", "--to", "ply", "--json")
     report = json.loads(ended.stdout.splitlines()[-1])

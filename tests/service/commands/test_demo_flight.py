@@ -56,12 +56,12 @@ def test_the_verdict_begins_with_what_holds_within_the_map() -> None:
         "position_sigma_v_median_m": 23.4, "sigma_absolute_median_m": 23.7,
         "trust": {"level": "georeferenced", "reasons": ["no"]},
     }  # fmt: skip
-    assert demo._verdict(quality) == (
+    assert demo.verdict(quality) == (
         "georeferenced: relative ± 5.4 cm, lengths ± 4.6 %, absolute ± 6.57 m across, ± 24 m up"
     )
     quality |= {"scale_sigma": None, "position_sigma_h_median_m": None}
-    assert demo._verdict(quality) == "georeferenced: relative ± 5.4 cm"
-    assert demo._verdict(quality | {"sigma_median_m": None}) == "georeferenced"
+    assert demo.verdict(quality) == "georeferenced: relative ± 5.4 cm"
+    assert demo.verdict(quality | {"sigma_median_m": None}) == "georeferenced"
 
 
 @pytest.mark.slow

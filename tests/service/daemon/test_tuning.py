@@ -18,7 +18,7 @@ from mavlink.component.parameters import PARAMETERS
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
-from service.commands.run import _reload
+from service.commands.run import reread
 from service.config import Config, change, load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.vehicle_config import TUNABLES, parameters_of, with_parameter
@@ -226,7 +226,7 @@ def test_of_two_reloads_the_newest_file_counts(tmp_path: Path) -> None:
         in_force.append(wanted.datalink.budget_kbit_s)
 
     daemon = Mock(reload=take)
-    second = threading.Thread(target=_reload, args=(daemon, None, path, []))
-    _reload(daemon, None, path, [])
+    second = threading.Thread(target=reread, args=(daemon, None, path, []))
+    reread(daemon, None, path, [])
     second.join()
     assert in_force == [300.0, 500.0]

@@ -110,7 +110,7 @@ def test_kernels_that_cannot_be_loaded_leave_the_rest_of_housekeeping(
     daemon.look()
     daemon.scanning.is_warm = True
     with pytest.raises(RuntimeError, match="no cache"):
-        daemon._housekeeping()
+        daemon.housekeeping()
     assert kept == [Path(daemon.config.scan.folder)]
 
 

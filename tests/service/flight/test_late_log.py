@@ -107,7 +107,7 @@ def test_a_time_that_the_operator_gives_stays(
         asked.append(set(unsure))
         return {}
 
-    monkeypatch.setattr("service.commands.replay._fly", fly)
+    monkeypatch.setattr("service.commands.replay.fly", fly)
     assert replayed(brief, tmp_path / "scan", *options).keys() == {"scan_folder"}
     assert asked == [unsure]
 
@@ -125,7 +125,7 @@ def test_a_date_for_a_log_without_one_leaves_its_clock_open(
         return {}
 
     monkeypatch.setattr(missing_metadata, "load_log", lambda path, config: log)
-    monkeypatch.setattr(replay, "_fly", fly)
+    monkeypatch.setattr(replay, "fly", fly)
     replayed(brief, tmp_path / "scan", "--video-epoch", str(EPOCH_S))
     assert asked == [(round(80e9), {"readout", "clock"})]
 

@@ -79,6 +79,18 @@ def sender(fleet: Path, folder: Path, member: str, claims: str, endpoint: str) -
     return DatalinkSender(store, config)
 
 
+def until_heads_bring(fleet: Path, endpoint: str, word: str, seen: list[str]) -> None:
+    """Ask as another ground station for the heads of all drones, until ``word`` is ``seen``."""
+    config = session_config(fleet / "ground" / "base", connect=(endpoint,))
+    with open_session(config) as station:
+
+        def is_seen() -> bool:
+            station.get("skyrelief/*/*/head", zenoh.handlers.RingChannel(1))
+            return word in seen
+
+        until(is_seen)
+
+
 def test_a_drone_writes_under_its_own_key_and_under_no_other(
     fleet: Path, tmp_path: Path, ground: tuple[Receiver, str]
 ) -> None:
@@ -105,12 +117,7 @@ def test_a_viewer_reads_and_cannot_write(
     link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
     try:
         assert link.drain(15.0)
-
-        def published() -> bool:
-            link._post(link._outbox.publish_heads)
-            return "skyrelief/red/scan-1/head" in seen
-
-        until(published)
+        until_heads_bring(fleet, endpoint, "skyrelief/red/scan-1/head", seen)
         viewer.put("skyrelief/red/scan-9/head", b'{"v":1,"numbers":{},"live":{},"finished":false}')
         time.sleep(0.5)
         assert [entry["scan"] for entry in receiver.progress()] == ["scan-1"]
@@ -264,12 +271,7 @@ def test_a_revoked_viewer_sees_nothing_and_its_successor_does(tmp_path: Path) ->
         link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
         up.callback(link.close)
         assert link.drain(15.0)
-
-        def published() -> bool:
-            link._post(link._outbox.publish_heads)
-            return "new" in seen
-
-        until(published)
+        until_heads_bring(fleet, endpoint, "new", seen)
         assert "old" not in seen
 
 

@@ -62,7 +62,7 @@ def test_the_numbers_of_the_fields_are_those_that_recordings_describe(recording:
         for one in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
             for message in one.message_type:
                 described[message.name] = {field.name: field for field in message.field}
-    for name, fields in mcap_import._FIELDS.items():
+    for name, fields in mcap_import.FIELDS.items():
         for field, number, kind, holds in fields:
             there = described[name][field]
             assert (there.number, there.type) == (number, kind), (name, field)
@@ -132,7 +132,7 @@ def test_a_recording_from_an_impossible_place_is_refused(
 ) -> None:
     with house.flown(tmp_path) as store:
         store.update_header(origin_lat_deg=None)
-        store._header = type(store.header)("s", "d", 1, origin_lat_deg=1e308, origin_lon_deg=0.0)
+        store.put_header(type(store.header)("s", "d", 1, origin_lat_deg=1e308, origin_lon_deg=0.0))
         export_mcap(store, tmp_path / "far.mcap")
     with pytest.raises(InputError, match="origin_lat_deg"):
         header_in(tmp_path / "far.mcap")
