@@ -1,8 +1,8 @@
 """What a process holds of a kernel that comes from numba's cache: its machine code.
 
-With the code numba also loads the kernel's intermediate form, which it needs only to compile
-another kernel that calls this one. Unpacked, those of a flight's kernels take 16 MiB; so they stay
-packed until then.
+With the code numba also loads what it needs only to compile another kernel, so that comes later,
+if at all: the kernel's intermediate form (those of a flight's kernels take 16 MiB unpacked), and
+the rules of all operations that it can compile, with LLVM's compiler (30 MiB).
 """
 
 from __future__ import annotations
@@ -10,7 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import llvmlite.binding as llvm
+from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
+from numba.core.runtime import _nrt_python
 
 
 class _Compact(JITCodeLibrary):  # type: ignore[misc]
@@ -33,6 +35,20 @@ class _Compact(JITCodeLibrary):  # type: ignore[misc]
         return super()._get_module_for_linking()
 
 
-def keep_packed() -> None:
+_load = (
+    FunctionCache._load_overload
+)  # of the file, without ``refresh``, which compiling calls itself
+
+
+def _load_overload(cache: Any, signature: Any, target_context: Any) -> Any:
+    """The kernel's code from its file, None without one."""
+    with cache._guard_against_spurious_io_errors():
+        return _load(cache, signature, target_context)
+
+
+def load_code_alone() -> None:
     """Let numba load kernels so from now on."""
+    for name, address in _nrt_python.c_helpers.items():  # as ``refresh`` does: code calls them
+        llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+    FunctionCache.load_overload = _load_overload
     JITCPUCodegen._library_class = _Compact

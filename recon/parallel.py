@@ -25,10 +25,12 @@ RELEASE_S = 1e-4
 CELLS_PER_THREAD = 1 << 20
 """Cells of a cost volume that are worth a thread: half a millisecond of simple work."""
 
-with suppress(ImportError):  # numba's own names, which another version need not have
-    from recon.compiled import keep_packed
+with suppress(
+    ImportError, AttributeError
+):  # numba's own names, which another version need not have
+    from recon.compiled import load_code_alone
 
-    keep_packed()  # before the first kernel is loaded
+    load_code_alone()  # before the first kernel is loaded
 
 _limit = 0  # threads that one call may use; 0: one per core
 

@@ -1,4 +1,4 @@
-"""Kernels from numba's cache: packed until another one is compiled that calls them."""
+"""Kernels from numba's cache: code alone, until another one is compiled that calls them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 KERNELS = """
+import numpy as np
 from numba import njit
 
 
 @njit(cache=True)
 def inner(x):
-    return 3 * x + 1
+    held = np.full((x, x), 3.0)
+    return int(np.linalg.norm(held)) + 1
 
 
 @njit
@@ -25,7 +27,9 @@ def outer(x):
 BOTH = """
 import recon.parallel
 from kernels import inner, outer
+from numba.core.runtime import rtsys
 assert inner(2) == 7
+assert not rtsys._init  # nothing is compiled
 library, = (found.library for found in inner.overloads.values())
 print(sum(inner.stats.cache_hits.values()), library._shared_module is None, outer(2))
 """
