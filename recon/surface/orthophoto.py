@@ -35,6 +35,9 @@ near the place itself, which may stand at a wall."""
 STEP_M = 0.5
 """Neighbours whose heights differ by more from the nearest cell's are not interpolated."""
 
+EDGE_CELLS = 1.2
+"""Sigma over which the outlines of what stands above its surroundings are smoothed."""
+
 EDGE_PX = 1.0
 STEPS = 17
 """Calls of ``progress`` in all."""
@@ -217,7 +220,7 @@ def _paint(
             a, b = y - r, x - c
             share[0], share[1] = (1.0 - a) * (1.0 - b), (1.0 - a) * b
             share[2], share[3] = a * (1.0 - b), a * b
-            near = _one_surface(height, r, c, share)
+            near = _one_surface(height, r, c, a, b, share)
             if near < 0:
                 continue
             known[i, j] = True
@@ -240,31 +243,53 @@ def _axes(places_m: F64) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def _one_surface(height: F32, r: int, c: int, share: F64) -> int:
-    """The cell of four that has the largest share of those of the surface with the largest share;
-    the others' shares become 0. -1 where most is unknown.
+def _one_surface(height: F32, r: int, c: int, down: float, right: float, share: F64) -> int:
+    """The cell of four that has the largest share of those of one surface, whose shares become 1
+    together, the others' 0. -1 where most is unknown.
 
-    So an edge runs across cells, not around them.
+    At a step it is the surface that most cells around are of, so an edge runs across cells, not
+    around them.
     """
-    best, most, unknown = -1, 0.0, 0.0
+    high, low, unknown = -np.inf, np.inf, 0.0
     for n in range(4):
         own = height[r + n // 2, c + n % 2]
         if np.isnan(own):
             unknown += share[n]
-            continue
-        total = 0.0
-        for m in range(4):
-            if abs(height[r + m // 2, c + m % 2] - own) <= STEP_M:
-                total += share[m]
-        if total > most + 1e-9 or (total > most - 1e-9 and share[n] > share[best]):
-            best, most = n, total
-    if best < 0 or unknown > 0.5:
+        else:
+            high, low = max(high, own), min(low, own)
+    if unknown > 0.5 or high < low:
         return -1
-    own = height[r + best // 2, c + best % 2]
+    middle, is_upper = low - 1.0, True
+    if high - low > STEP_M:
+        middle = 0.5 * (high + low)
+        is_upper = _is_upper(height, r + down, c + right, middle)
+    best = -1
+    for n in range(4):
+        own = height[r + n // 2, c + n % 2]
+        if (own > middle) != is_upper or np.isnan(own):
+            share[n] = 0.0
+        elif best < 0 or share[n] > share[best]:
+            best = n
+    own, total = height[r + best // 2, c + best % 2], 0.0
+    share[best] = max(share[best], 1e-9)
     for n in range(4):
         if not abs(height[r + n // 2, c + n % 2] - own) <= STEP_M:
             share[n] = 0.0
+        total += share[n]
+    share /= total
     return best
+
+
+@njit(cache=True, nogil=True)
+def _is_upper(height: F32, row: float, col: float, middle: float) -> bool:
+    """Whether most cells around a place, by a Gaussian of EDGE_CELLS, are above a height."""
+    vote, reach = 0.0, int(np.ceil(2.0 * EDGE_CELLS))
+    for i in range(max(int(row) - reach + 1, 0), min(int(row) + reach + 1, height.shape[0])):
+        for j in range(max(int(col) - reach + 1, 0), min(int(col) + reach + 1, height.shape[1])):
+            if not np.isnan(height[i, j]):
+                weight = np.exp(-0.5 * ((row - i) ** 2 + (col - j) ** 2) / EDGE_CELLS**2)
+                vote += weight if height[i, j] > middle else -weight
+    return vote > 0.0
 
 
 @njit(cache=True, nogil=True)
