@@ -230,8 +230,7 @@ def _make(kind: str, site: Path, parts: Any, scheduler: str | None, progress: Pr
         return
     with ScanView(site, None, progress) as view:
         if kind == "change":
-            found = changes(view, site, parts, PLACING_M, options)
-            count = 0 if found is None else len(found.objects)
+            count = len(changes(view, site, parts, options).objects)
             (site / FOUND).write_text(json.dumps(count), encoding="utf-8")
         else:
             export(view, kind, None, options)

@@ -126,9 +126,9 @@ class ScanView:
         self._making: dict[Any, threading.Lock] = {}
         self._lock = threading.Lock()
         self._datums: tuple[str, str] | None = None  # heights from the first to the second
-        self._box = EVERYWHERE
+        self.box = EVERYWHERE  # ENU m, of the points that are seen
         if tile is not None:
-            self._box = tile.wide
+            self.box = tile.wide
             self.store.only(tile.seqs)
         self.store.hold_decoded()  # several deliverables go over all keyframes
 
@@ -211,7 +211,7 @@ class ScanView:
 
     def _fuse(self) -> FusedCloud:
         with self.progress.part("fusing the cloud", FUSING):
-            fused = fused_cloud(self.store, self._voxel_m, self.progress, self._box)
+            fused = fused_cloud(self.store, self._voxel_m, self.progress, self.box)
         if not len(fused.cloud):
             raise NoPointsError(f"{self.folder} {NO_POINTS}")
         return fused

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterable
+from html import escape
 from typing import Any
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 
 from recon.surface.raster import Grid, Raster, hillshade
 from recon.types import F64, U8
+from service.scans.report_parts import table
 
 ADDED, REMOVED = (40, 90, 230), (220, 120, 30)  # BGR
 PAGE_PX = 1400
@@ -31,18 +33,18 @@ end of the white line.</p>
 """
 
 
-HEAD = "<tr><th>object<th>kind<th>area, m²<th>volume, m³<th>95 %, m³<th>highest, m</tr>"
+HEAD = "object", "kind", "area, m²", "volume, m³", "95 %, m³", "highest, m"
 
 
 def page(document: dict[str, Any], images: tuple[U8, U8]) -> str:
     """A page without scripts, as the portal allows none: both dates under a slider, the objects."""
-    from html import escape
-
-    rows = "".join(
-        f"<tr><td>{n}<td>{one['kind']}<td>{one['area_m2']:.1f}<td>{one['volume_m3']:+.2f}"
-        f"<td>{1.96 * one['sigma_m3']:.2f}<td>{one['peak_m']:+.2f}</tr>"
+    rows = [
+        [
+            str(n), one["kind"], f"{one['area_m2']:.1f}", f"{one['volume_m3']:+.2f}",
+            f"{1.96 * one['sigma_m3']:.2f}", f"{one['peak_m']:+.2f}",
+        ]
         for n, one in enumerate(document["objects"], 1)
-    )
+    ]  # fmt: skip
     return PAGE.format(
         title=escape(f"Change {document['before']['scan']} to {document['after']['scan']}"),
         words=escape(document["in_words"]),
@@ -50,7 +52,7 @@ def page(document: dict[str, Any], images: tuple[U8, U8]) -> str:
         after=_utc(document["after"]["started"]),
         one=_embedded(images[0]),
         two=_embedded(images[1]),
-        table=rows and f"<table>{HEAD}{rows}</table>",
+        table=table(rows, HEAD),
         notes="".join(f"<p>{escape(note)}</p>" for note in document["notes"]),
     )
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -29,15 +31,15 @@ from recon.types import F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
-from service.offline.exports.view import USUAL, ExportOptions, ScanView
+from service.offline.exports.view import USUAL, ExportOptions, ScanView, in_parts
 from service.offline.geopackage import polygons, write_layers
 from service.offline.site.alignment import AlignedSite, align_site, write_files
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
 from service.offline.site.gather import Member
-from service.offline.tiles import Tile, grown, run_tiles
+from service.offline.tiles import grown
 from service.progress import Progress
-from service.scans.fused_cloud import fused_cloud, placed
-from service.scans.main_piece import Piece
+from service.scans.fused_cloud import Box, fused_cloud, placed
+from service.scans.main_piece import Piece, main_seqs
 from service.scans.track import local_frame
 from service.scans.writing import write_whole
 from service.stream import codec
@@ -53,17 +55,8 @@ MARGIN_M = 40.0
 """Around a tile: bending is a mean over 10 m (1 sigma); a smaller object is measured whole."""
 
 
-@dataclass(frozen=True, slots=True)
-class ChangeJob:
-    """One tile of a comparison, in plain values."""
-
-    tile: Tile
-    parts: tuple[tuple[int, int], tuple[int, int]]  # first and last keyframe of both dates
-    voxels_m: tuple[float | None, ...]
-    cell_m: float | None
-    whole: Grid | None  # of all tiles; None: this is the only one
-    alignment_m: float  # sigma, horizontal
-    bare: bool  # only where both dates show bare ground
+Dates = tuple[tuple[int, int], tuple[int, int]]
+"""First and last keyframe of both dates."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,14 +71,14 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ChangePart:
-    """What changed on one tile."""
+class Changes:
+    """What changed on a tile or on all of them, but for the map."""
 
-    layers: Layers
     objects: list[Found]
     images: tuple[U8, U8]  # BGR, before and after
+    cell_m: float
     compared_m2: float
-    alignment_m: float
+    alignment_m: float  # largest of the tiles
 
 
 def compare(
@@ -109,11 +102,8 @@ def compare(
     with ScanView(out, None, progress) as view:
         view.needs_place("a comparison")
         first, last = ((m.first, m.last) for m in (site.members[one], site.members[two]))
-        apart = _apart_m(site, one, two)
         with progress.part("comparing the surfaces", 0.7):
-            found = changes(view, out, (first, last), apart, options, bare)
-        if found is None:
-            raise InputError(f"{before} and {after} share no ground")
+            found = changes(view, out, (first, last), options, bare)
         document = _document(site, found, one, two)
         _write_polygons(view, out / CHANGE_GPKG, found)
         write_whole(out / CHANGE_PAGE, page(document, found.images))
@@ -125,57 +115,39 @@ def compare(
     return document
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Changes:
-    """What changed on all tiles, but for the map, which is in its file."""
-
-    objects: list[Found]
-    images: tuple[U8, U8]
-    cell_m: float
-    compared_m2: float
-    alignment_m: float  # largest of the tiles
-
-
 def changes(
     view: ScanView,
     out: Path,
-    parts: tuple[tuple[int, int], tuple[int, int]],
-    alignment_m: float,
+    parts: Dates,
     options: ExportOptions = USUAL,
     bare: bool = False,
-) -> Changes | None:
+) -> Changes:
     """Compare two dates of a site, ``parts`` of its keyframes, and write change.tif into ``out``.
 
-    ``alignment_m`` is what the two are misaligned by (1 sigma). None where they share no ground.
+    Raises InputError where they share no ground.
     """
-    cut, cell_m = view.tiling(options, MARGIN_M), options.cell_m
-    whole: Grid | None = None
-    voxels: tuple[float | None, ...] = (None, None)
+    cut, whole = view.tiling(options, MARGIN_M), None
+    voxels_m: list[float | None] = [None, None]
     if len(cut.tiles) > 1:
-        usual = [
-            float(
-                np.median(
-                    [p.ground_sample_m for p in cut.prints if a <= p.seq <= b] or [cut.sample_m]
-                )
-            )
+        samples_m = [
+            [p.ground_sample_m for p in cut.prints if a <= p.seq <= b] or [cut.sample_m]
             for a, b in parts
         ]
-        voxels, whole = tuple(usual), over(grown(cut.bounds, 2.0), cell_m or max(usual))
-    jobs = [ChangeJob(tile, parts, voxels, cell_m, whole, alignment_m, bare) for tile in cut.tiles]
-    made = run_tiles(change_tile, jobs, options.scheduler, view.progress)
-    compared = (part for part in made if part is not None)
-    first = next(compared, None)
-    if first is None:
-        return None
-    grid = whole or first.layers.grid
+        usual_m = [float(np.median(one)) for one in samples_m]
+        voxels_m = [*usual_m]
+        whole = over(grown(cut.bounds, 2.0), options.cell_m or max(usual_m))
+    make = partial(change_part, parts=parts, voxels_m=voxels_m, whole=whole, bare=bare)
+    made = in_parts(view, make, options, MARGIN_M, nothing="has no ground that both dates show")
+    first = next(made)
+    grid = whole or first[0].grid
     blank: U8 = np.full((*shape_of(grid), 3), 255, np.uint8)
     images = blank, blank.copy()
     objects: list[Found] = []
     area, alignment = 0.0, 0.0
-    with mosaic(view, out / CHANGE_TIF, grid, first.layers) as map_:
-        for part in chain([first], compared):
-            put(map_, part.layers)
-            rows, cols = place_in(part.layers.grid, grid)
+    with mosaic(view, out / CHANGE_TIF, grid, first[0]) as map_:
+        for layers, part in chain([first], made):
+            put(map_, layers)
+            rows, cols = place_in(layers.grid, grid)
             for canvas, image in zip(images, part.images, strict=True):
                 canvas[rows, cols] = image
             area, alignment = area + part.compared_m2, max(alignment, part.alignment_m)
@@ -185,7 +157,7 @@ def changes(
     for image in images:
         for one in objects:
             draw_outlines(image, chain(*one.rings), one.body.volume_m3 > 0, grid)
-    return Changes(objects, images, grid.cell_m, area, alignment) if area else None
+    return Changes(objects, images, grid.cell_m, area, alignment)
 
 
 def _numbered(image: Any, objects: list[Found]) -> list[Found]:
@@ -202,43 +174,40 @@ def _numbered(image: Any, objects: list[Found]) -> list[Found]:
     return kept
 
 
-def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart | None:
-    """What changed on one tile; None where it has no ground of both dates."""
-    with ScanView(Path(job.tile.folder), None, progress, job.tile) as view:
-        made = surfaces(view, job)
-        if made is None:
-            return None
-        site_m2 = None
-        if job.whole is not None:
-            site_m2 = float(np.prod(job.whole.shape)) * job.whole.cell_m**2
-        change = change_between(*made, ground_m2=site_m2)
-    grid = change.grid
-    rows, cols = grid.window(job.tile.box)
-    if rows.start >= rows.stop or cols.start >= cols.stop:
+def change_part(
+    view: ScanView, options: ExportOptions, box: Box, parts: Dates,
+    voxels_m: Sequence[float | None], whole: Grid | None, bare: bool,
+) -> tuple[Layers, Changes] | None:  # fmt: skip
+    """What changed in a box of the site, and its map; None where it has no ground of both dates.
+
+    ``whole`` is the grid of all tiles, None where this is the only one; with ``bare`` only ground
+    that is bare at both dates counts.
+    """
+    made = surfaces(view, parts, voxels_m, options.cell_m if whole is None else whole.cell_m, bare)
+    if made is None:
         return None
-    if job.whole is not None:
+    site_m2 = None if whole is None else float(np.prod(whole.shape)) * whole.cell_m**2
+    change = change_between(*made, ground_m2=site_m2)
+    grid = change.grid
+    rows, cols = grid.window(box)
+    if whole is not None:
         change = of_tile(change, rows, cols, int(MARGIN_M / grid.cell_m))
     known = np.isfinite(change.height_m)
+    if not known[rows, cols].any():
+        return None
     flat = np.zeros(grid.shape, np.float32)
     bands = np.stack(
         [np.where(known, x, NODATA_M) for x in (change.height_m, change.sigma_m, flat)]
     )
     names = ("after less before, m", "sigma, m", "object")
-    layers = Layers(grid, bands.astype(np.float32), names, NODATA_M).within(job.tile.box)
-    place = place_in(layers.grid, job.whole or layers.grid)
+    layers = Layers(grid, bands.astype(np.float32), names, NODATA_M).within(box)
+    place = place_in(layers.grid, whole or layers.grid)
     size = (place[1].stop - place[1].start, place[0].stop - place[0].start)
     one, two = (drawn(raster, rows, cols, size) for raster in made)
-    return ChangePart(
-        layers, [_found(change, body, known) for body in change.bodies], (one, two),
+    return layers, Changes(
+        [_found(change, body, known) for body in change.bodies], (one, two), grid.cell_m,
         float(known[rows, cols].sum()) * grid.cell_m**2, change.alignment_m,
     )  # fmt: skip
-
-
-def _apart_m(site: AlignedSite, one: int, two: int) -> float:
-    """Median distance of the ties between the two scans after the alignment, 0 without any."""
-    names = {site.members[one].name, site.members[two].name}
-    return max((p["apart_after_m"] for p in site.document["pairs"] if {p["a"], p["b"]} == names),
-               default=0.0)  # fmt: skip
 
 
 def _found(change: Change, body: Body, known: Bool) -> Found:
@@ -277,28 +246,29 @@ def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
     return one, two
 
 
-def surfaces(view: ScanView, job: ChangeJob) -> tuple[Raster, Raster] | None:
+def surfaces(
+    view: ScanView, parts: Dates, voxels_m: Sequence[float | None], cell_m: float | None, bare: bool
+) -> tuple[Raster, Raster] | None:
     """The mean surface of both dates in the site, on one grid of its CRS; None without points."""
-    box = job.tile.wide
+    seqs = main_seqs(view.store)
     clouds = [
         fused_cloud(
-            Piece(view.store, [seq for seq in view.store.seqs() if first <= seq <= last]),
-            voxel,
+            Piece(view.store, [seq for seq in seqs if first <= seq <= last]),
+            voxel_m,
             view.progress,
-            box,
+            view.box,
         )
-        for (first, last), voxel in zip(job.parts, job.voxels_m, strict=True)
+        for (first, last), voxel_m in zip(parts, voxels_m, strict=True)
     ]
     if not all(len(fused.cloud) for fused in clouds):
         return None
     places = [placed(fused.cloud, view.frame) for fused in clouds]
-    cell = job.cell_m or max(fused.voxel_m for fused in clouds)
-    grid = view.grid_of(np.vstack(places), cell)
+    grid = view.grid_of(np.vstack(places), cell_m or max(fused.voxel_m for fused in clouds))
     one, two = (
         level_filled(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
     )
-    return (_bare(one), _bare(two)) if job.bare else (one, two)
+    return (_bare(one), _bare(two)) if bare else (one, two)
 
 
 def _bare(surface: Raster) -> Raster:
