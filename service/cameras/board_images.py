@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from recon.calibration.board import Board, BoardView, Calibration, find_board
 from recon.types import F32, F64, U8
 from service.errors import InputError
+from service.progress import Progress
 
 STILLS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm")
 VIDEO_STEP_S = 0.4
@@ -29,15 +30,15 @@ class BoardSet:
 
 
 def find_boards(
-    sources: Sequence[Path], board: Board, say: Callable[[str], object] = lambda text: None
+    sources: Sequence[Path], board: Board, progress: Progress | None = None
 ) -> BoardSet:
     """Find the board in images, folders of images, or videos; InputError when none is usable."""
     views: list[BoardView] = []
     missed: list[tuple[str, str]] = []
     size: tuple[int, int] | None = None
-    say("looking for the board")
-    for name, gray in _images(sources):
-        say(f"{name}: {len(views)} boards so far")
+    progress = progress or Progress()
+    for name, gray in _images(sources, progress):
+        progress(f"{name}: {len(views)} boards so far")
         if gray is None:
             missed.append((name, "cannot be read as an image"))
             continue
@@ -64,21 +65,22 @@ def _is_repeat(corners: F32, views: Sequence[BoardView], size: tuple[int, int]) 
     return any(float(np.abs(v.corners_px - corners).max()) < limit for v in views)
 
 
-def _images(sources: Sequence[Path]) -> Iterator[tuple[str, U8 | None]]:
+def _images(sources: Sequence[Path], progress: Progress) -> Iterator[tuple[str, U8 | None]]:
     """(name, gray image) of every source in turn; None when a file cannot be read."""
-    for source in sources:
-        if source.is_dir():
-            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in STILLS)
-            if not inside:
-                raise InputError(f"{source}: no images in this folder ({', '.join(STILLS)})")
-            for path in inside:
-                yield path.name, _still(path)
-        elif not source.exists():
-            raise InputError(f"{source}: no such file or folder")
-        elif source.suffix.lower() in STILLS:
-            yield source.name, _still(source)
-        else:
-            yield from _video(source)
+    for k, source in enumerate(sources):
+        with progress.part(progress.text, 1.0 / (len(sources) - k)):
+            if source.is_dir():
+                inside = sorted(p for p in source.iterdir() if p.suffix.lower() in STILLS)
+                if not inside:
+                    raise InputError(f"{source}: no images in this folder ({', '.join(STILLS)})")
+                for path in progress.over(inside, len(inside)):
+                    yield path.name, _still(path)
+            elif not source.exists():
+                raise InputError(f"{source}: no such file or folder")
+            elif source.suffix.lower() in STILLS:
+                yield source.name, _still(source)
+            else:
+                yield from _video(source, progress)
 
 
 def _still(path: Path) -> U8 | None:
@@ -87,12 +89,12 @@ def _still(path: Path) -> U8 | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-def _video(path: Path) -> Iterator[tuple[str, U8]]:
+def _video(path: Path, progress: Progress) -> Iterator[tuple[str, U8]]:
     from service.cameras import open_camera
 
     due_ns = 0
     with closing(open_camera(f"file:{path}")) as camera:
-        for frame in camera:
+        for frame in progress.over(camera, camera.images):
             if frame.time_ns >= due_ns:
                 due_ns = frame.time_ns + round(VIDEO_STEP_S * 1e9)
                 gray = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)

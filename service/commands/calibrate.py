@@ -41,7 +41,8 @@ def calibrate(
         board = Board(int(corners[1]), int(corners[2]), square_m)
     check_writable(out)
     with showing("calibrate") as progress:
-        boards = find_boards(sources, board, progress)
+        with progress.part("looking for the board", 0.9):
+            boards = find_boards(sources, board, progress)
         if len(boards.views) < MIN_VIEWS:
             raise InputError(
                 f"the board was found in {len(boards.views)} of "

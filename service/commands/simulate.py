@@ -143,19 +143,19 @@ def simulate(given: SimulateOptions) -> None:
     --live plays it in real time, as a camera's stream and an autopilot's MAVLink. A flight that
     exists is not rendered again.
     """
-    from service.scans.writing import check_writable, filling_folder
-    from service.sim import recording
-
     if given.live and (given.out / "flight.mp4").exists():
         _play(given)
         return
     started = time.monotonic()
     with refusing("simulate"), showing("simulate") as progress:
+        progress("laying out the site")
+        from service.scans.writing import check_writable, filling_folder
+        from service.sim import recording
+
         options = given.simulation()
         if any((given.out / name).exists() for name in ("flight.mp4", "truth")):
             raise InputError(f"{given.out} already holds a flight; give another folder with --out")
         check_writable(given.out, is_folder=True)
-        progress("laying out the site")
         simulation = recording.prepare(options)
     with showing("simulate") as progress, filling_folder(given.out) as part:
 

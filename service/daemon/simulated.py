@@ -102,6 +102,7 @@ def state_folder() -> Path:
 
 
 def render_flight(folder: Path, given: dict[str, str]) -> None:
+    log.info("laying out the site of the simulated flight; rendering takes some minutes, once")
     from service.sim import recording
     from service.sim.flight import FlightPlan
 
@@ -114,7 +115,6 @@ def render_flight(folder: Path, given: dict[str, str]) -> None:
             fps=float(given["fps"]),
             depth_frames=0,
         )
-        log.info("laying out the site of the simulated flight; rendering takes some minutes, once")
         simulation = recording.prepare(options)
     notifier = Notifier()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -195,6 +196,8 @@ def run(*arguments: str) -> dict[str, object]:
         raise result.exception
     report = json.loads(result.stdout.strip().splitlines()[-1])
     assert isinstance(report, dict)
+    shares = [int(share) for share in re.findall(r", (\d+) %", result.stderr)]
+    assert shares == sorted(shares) and shares[-1] == 90 and len(set(shares)) > 3  # grows
     return report
 
 
