@@ -21,7 +21,7 @@ import msgspec
 
 from service.errors import InputError, MissingError, OutsideError, SkyreliefError
 from service.ground.mcap_import import header_in, store_from_mcap
-from service.ground.scan_facts import Labels, facts_of, read_strictly
+from service.ground.scan_facts import Labels, facts_of, is_current, read_strictly
 from service.ground.storage import (
     OTHER_FILES,
     SITES,
@@ -134,6 +134,7 @@ class Library:
             "preview": is_regular(folder / "preview.jpg"),
             "thumbnail": is_regular(folder / "thumbnail.webp"),
             "tiles": is_regular(folder / "3dtiles" / "tileset.json"),
+            "meshed": is_current(folder / "mesh.glb"),
             "maps": is_regular(folder / "maps" / "manifest.json"),
             "started_unix_s": None,
             "origin": None,

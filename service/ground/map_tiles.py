@@ -35,6 +35,7 @@ from service.ground.live_map import (
     on_map,
     pixel_m,
 )
+from service.ground.scan_facts import is_current
 from service.ground.state import PortalState, folder_of, state_of
 from service.offline.exports.rasters import open_map
 from service.scans.coverage import Coverage
@@ -165,11 +166,11 @@ def newer_raster(folder: Path, layer: str) -> Path | None:
     """The exported raster of a layer, unless the scan has changed since."""
     try:
         path = folder / RASTERS[layer]
-        is_newer = path.stat().st_mtime >= (folder / SUMMARY).stat().st_mtime
         import rasterio  # noqa: F401
+
+        return path if (folder / SUMMARY).exists() and is_current(path) else None
     except (OSError, KeyError, ImportError):
         return None
-    return path if is_newer else None
 
 
 def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:

@@ -113,6 +113,15 @@ def facts_of(folder: Path) -> dict[str, Any]:
         return _from_store(store).shown()
 
 
+def is_current(product: Path) -> bool:
+    """Whether a file was made of the scan beside it as that is now: no older than its
+    ``scan.json``."""
+    if not is_regular(product):
+        return False
+    summary = product.with_name(SUMMARY)
+    return not summary.exists() or product.stat().st_mtime >= summary.stat().st_mtime
+
+
 def ground_in(path: Path) -> Ground:
     """When and where a scan was flown, from its ``scan.json``; InputError if it cannot be read."""
     return _of_summary(path, Ground)

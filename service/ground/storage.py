@@ -237,11 +237,14 @@ def check_room(size: int, target: Path, room_bytes: int | None = None) -> None:
 
 
 def _copy(handle: int, target: Path, size: int) -> None:
-    """The first ``size`` bytes; a file that grows meanwhile takes no more."""
+    """The first ``size`` bytes; a file that grows meanwhile takes no more. It stays as old, so that
+    a product is still known to be of its scan (:func:`service.ground.scan_facts.is_current`)."""
+    written = os.fstat(handle)
     with open(target, "xb") as out:
         while size > 0 and (block := os.read(handle, min(BLOCK_BYTES, size))):
             out.write(block)
             size -= len(block)
+    os.utime(target, ns=(written.st_atime_ns, written.st_mtime_ns))
 
 
 class _Bounded:

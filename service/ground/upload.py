@@ -10,9 +10,11 @@ scan's files are unpacked, wherever they lie in it, so that no path in it is eve
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shutil
 import struct
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
@@ -233,3 +235,6 @@ def _copy(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path) -> No
         raise InputError("the ZIP is compressed by another method than deflate")
     with archive.open(member) as source, open(target, "xb") as out:
         shutil.copyfileobj(source, out, BLOCK_BYTES)  # zipfile reads no more than it claims
+    with contextlib.suppress(ValueError, OverflowError):  # of no such day
+        packed = time.mktime((*member.date_time, 0, 0, -1))
+        os.utime(target, (packed, packed))  # a product stays known to be of its scan

@@ -31,6 +31,8 @@ export interface Scan {
   preview: boolean;
   thumbnail: boolean;
   tiles: boolean;
+  /** mesh.glb is of the scan as it is now. */
+  meshed: boolean;
   maps: boolean;
   started_unix_s: number | null;
   origin: Origin | null;

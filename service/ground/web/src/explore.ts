@@ -23,7 +23,7 @@ export interface Site {
 }
 
 /** A slider over the keyframes: all as it was when each was taken, played if one likes; at its end it follows. */
-export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElement; refresh: () => void } {
+export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElement; refresh: () => void; toEnd: () => void } {
   const input = el("input", { type: "range", min: "1", value: "1", max: "1" });
   input.setAttribute("aria-label", "time of the flight");
   const shown = el("output", {});
@@ -78,7 +78,13 @@ export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElem
     if (followed) input.value = input.max;
     show();
   };
-  return { element, refresh };
+  const toEnd = (): void => {
+    if (input.value === input.max) return;
+    input.value = input.max;
+    stop();
+    show();
+  };
+  return { element, refresh, toEnd };
 }
 
 /** A time: seconds of a flight, the date of a site. */

@@ -64,26 +64,29 @@ async function film(stage: Stage, views: View[], each_s: number): Promise<Blob> 
   stage.follow = false;
   stage.controls.enabled = false;
   stage.painter.isFilmed = true; // else a slow card's film would be as coarse as its view while it moves
-  const whole_ms = 1000 * each_s * (views.length - 1);
-  const began = performance.now();
-  recorder.start();
-  await new Promise<void>((done) => {
-    const step = (): void => {
-      const share = Math.min(1, (performance.now() - began) / whole_ms);
-      stage.camera.position.copy(from.getPoint(share));
-      stage.controls.target.copy(at.getPoint(share));
-      stage.controls.update();
-      stage.touch();
-      if (share < 1) requestAnimationFrame(step);
-      else done();
-    };
-    requestAnimationFrame(step);
-  });
-  await new Promise((resolve) => setTimeout(resolve, 1000 / FRAMES_PER_S));
-  recorder.stop();
-  stage.controls.enabled = true;
-  stage.painter.isFilmed = false;
-  await stopped;
-  for (const track of stream.getTracks()) track.stop(); // it would read every later frame too
+  try {
+    recorder.start();
+    const whole_ms = 1000 * each_s * (views.length - 1);
+    const began = performance.now();
+    await new Promise<void>((done) => {
+      const step = (): void => {
+        const share = Math.min(1, (performance.now() - began) / whole_ms);
+        stage.camera.position.copy(from.getPoint(share));
+        stage.controls.target.copy(at.getPoint(share));
+        stage.controls.update();
+        stage.touch();
+        if (share < 1) requestAnimationFrame(step);
+        else done();
+      };
+      requestAnimationFrame(step);
+    });
+    await new Promise((resolve) => setTimeout(resolve, 1000 / FRAMES_PER_S));
+    recorder.stop();
+    await stopped;
+  } finally {
+    stage.controls.enabled = true;
+    stage.painter.isFilmed = false;
+    for (const track of stream.getTracks()) track.stop(); // it would read every later frame too
+  }
   return new Blob(parts, { type });
 }

@@ -67,7 +67,7 @@ function candidates(root: THREE.Object3D, camera: THREE.Camera, pointer: THREE.V
  * The point of the scene under `pointer`; null when there is none.
  *
  * Of points: within the smallest radius that has any, on the nearest surface, the one
- * closest to the pointer. Of a mesh: where the ray meets it.
+ * closest to the pointer. Of a mesh: where the ray meets it, unless that was filled in.
  */
 export function pick(root: THREE.Object3D, camera: THREE.Camera, pointer: THREE.Vector2, size: THREE.Vector2, limit = Infinity): THREE.Vector3 | null {
   camera.updateMatrixWorld();
@@ -84,7 +84,14 @@ export function pick(root: THREE.Object3D, camera: THREE.Camera, pointer: THREE.
   caster.setFromCamera(pointer, camera);
   const meshes: THREE.Object3D[] = [];
   root.traverse((node) => node instanceof THREE.Mesh && meshes.push(node));
-  return caster.intersectObjects(meshes, false)[0]?.point ?? null;
+  const hit = caster.intersectObjects(meshes, false)[0];
+  return hit && isMeasured(hit) ? hit.point : null;
+}
+
+/** Whether a mesh of ours says that two corners of the triangle were measured; any other one says nothing. */
+function isMeasured({ object, face }: THREE.Intersection): boolean {
+  const measured = (object as THREE.Mesh<THREE.BufferGeometry>).geometry.getAttribute("_measured");
+  return !measured || !face || [face.a, face.b, face.c].filter((k) => measured.getX(k) > 0.5).length > 1;
 }
 
 /** The point of a scene at a place of the page. */

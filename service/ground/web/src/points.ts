@@ -349,10 +349,14 @@ export class Cloud implements Gradual {
     return this.last === Infinity;
   }
 
+  /** Called when the time slider leaves keyframes out. */
+  leftEnd: () => void = () => undefined;
+
   /** Shows the keyframes up to a time only, unix seconds. */
   until(time: number): void {
     if (time === this.last) return;
     this.last = time;
+    if (!this.isWhole) this.leftEnd();
     this.groundStale = true;
     for (const [own, held] of this.chunks) this.show(own, held);
   }

@@ -14,6 +14,7 @@ import type { Stage } from "./stage";
 import * as units from "./units";
 
 const COVERAGE_EVERY_MS = 5000;
+const [MAX_PHONE_BYTES, MAX_UNASKED_BYTES] = [12e6, 80e6];
 
 export interface Parts {
   stage: Stage;
@@ -23,15 +24,15 @@ export interface Parts {
   notes: Notes;
   legend: HTMLElement;
   coverage: HTMLElement;
-  time: HTMLElement;
+  time: { toEnd: () => void };
   finished: () => boolean;
   id: { drone: string; scan: string };
   /** The scan as last heard of. */
   known: () => api.Scan;
 }
 
-/** Everything right of the title. */
-export function toolbar(parts: Parts): HTMLElement {
+/** Everything right of the title; `refresh` takes in what is known of the scan. */
+export function toolbar(parts: Parts): { element: HTMLElement; refresh: () => void } {
   const { stage } = parts;
   const bar = el("span", { className: "tools" });
   const follow = el("button", {
@@ -49,17 +50,18 @@ export function toolbar(parts: Parts): HTMLElement {
     title: "show all of it; W A S D R F fly",
     onclick: () => ((stage.follow = false), stage.frame()),
   });
+  const layers = showGroup(parts, colour);
   bar.append(
     group(colour),
     group(whole, follow, linkButton(parts)),
     group(...measure(parts), cameraButton(parts.cameras), coverageButton(parts)),
-    ...showGroup(parts, colour),
+    ...layers.elements,
     clipBox(parts),
     filmBox(parts),
     settings(parts),
   );
   void stage.vr().then((button) => button && bar.append(button));
-  return bar;
+  return { element: bar, refresh: layers.refresh };
 }
 
 const group = (...children: HTMLElement[]): HTMLElement => el("span", { className: "group" }, ...children);
@@ -169,9 +171,9 @@ function productsOf({ stage, id, known }: Parts): Product[] {
   const mesh: Product = {
     name: "Mesh",
     kind: "glb",
-    title: "the textured mesh",
-    below: "none",
-    has: (scan) => scan.files.some((f) => f.name === "mesh.glb"),
+    title: "the closed surface, as it is exported",
+    below: "ground", // beyond its edge
+    has: (scan) => scan.meshed,
     open: async () => {
       const remove = await stage.load(api.file(id, "mesh.glb"));
       document.body.dataset["mesh"] = "shown";
@@ -207,58 +209,91 @@ function productsOf({ stage, id, known }: Parts): Product[] {
   return [tiles, mesh, splats];
 }
 
-/** Surface, points or a product: one at a time; colours and time are of the keyframes. */
-function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement[] {
-  const { stage, cloud, known } = parts;
+/**
+ * Surface, points or a product: one at a time. Figures, time and what was measured alone are of the keyframes: who
+ * asks for them from a product gets the surface.
+ */
+function showGroup(parts: Parts, colour: HTMLSelectElement): { elements: HTMLElement[]; refresh: () => void } {
+  const { stage, cloud, known, finished, time } = parts;
   const surface = el("button", { textContent: "Surface", className: "on", title: "the depth images as they are" });
   const points = el("button", { textContent: "Points" });
-  const own = [surface, points];
-  const buttons = [...own];
+  const measured = el("button", { textContent: "Measured only", title: "without what is filled in where nothing was seen" });
+  const buttons = [surface, points];
   let by = colour.value; // of the keyframes; a product has its own colours
-  const show = async (chosen: HTMLButtonElement, layer: Layer, open: () => Promise<() => void>): Promise<void> => {
-    buttons.forEach((b) => (b.disabled = true));
-    try {
-      stage.shows(await open());
-      const isOwn = own.includes(chosen);
-      cloud.layer = layer;
-      if (!colour.disabled) by = colour.value;
-      colour.disabled = !isOwn;
-      colour.value = isOwn ? by : "colour";
-      measured.disabled = layer === "points" || layer === "none";
-      for (const part of [parts.legend, parts.time]) part.classList.toggle("off", !isOwn);
-      stage.touch();
-      buttons.forEach((b) => pressed(b, b === chosen));
-    } catch (error) {
-      notify(error);
+  let isProduct = false;
+  let turn = 0; // of what is loading, the last is shown
+  const only = (on: boolean): void => {
+    cloud.measuredOnly = on;
+    pressed(measured, on);
+  };
+  const show = (chosen: HTMLButtonElement, layer: Layer, remove?: () => void): void => {
+    turn++;
+    if (!isProduct) by = colour.value;
+    isProduct = remove !== undefined;
+    stage.shows(remove ?? (() => undefined));
+    cloud.layer = layer;
+    if (isProduct) {
+      only(false);
+      time.toEnd();
     }
-    buttons.forEach((b) => (b.disabled = false));
+    colour.value = isProduct ? "colour" : by;
+    parts.legend.classList.toggle("off", isProduct);
+    measured.disabled = layer === "points";
+    stage.touch();
+    buttons.forEach((b) => pressed(b, b === chosen));
   };
-  const measured = el("button", { textContent: "Measured only", title: "without the ground that is filled in where nothing was seen" });
+  const toSurface = (): void => show(surface, "surface");
+  surface.onclick = toSurface;
+  points.onclick = () => show(points, "points");
+  colour.addEventListener("change", () => {
+    if (!isProduct) return;
+    by = colour.value;
+    toSurface();
+  });
+  cloud.leftEnd = () => isProduct && toSurface();
   measured.onclick = () => {
-    cloud.measuredOnly = !cloud.measuredOnly;
-    pressed(measured, cloud.measuredOnly);
+    if (isProduct) toSurface();
+    only(!cloud.measuredOnly);
   };
-  surface.onclick = () => void show(surface, "surface", async () => () => undefined);
-  points.onclick = () => void show(points, "points", async () => () => undefined);
-  for (const product of productsOf(parts)) {
-    const { name, title, below, has, open } = product;
-    const button = el("button", { textContent: has(known()) ? name : `Make ${name.toLowerCase()}`, title });
+  const rows = productsOf(parts).map((product) => {
+    const { name, kind, title, below, has, open } = product;
+    const button = el("button", { title, hidden: !has(known()) });
+    const load = async (): Promise<void> => {
+      const own = ++turn;
+      const remove = await open();
+      if (own === turn) show(button, below, remove);
+      else remove();
+    };
     button.onclick = async () => {
       button.disabled = true;
       try {
         await made(product, parts);
         button.textContent = name;
-        await show(button, below, open);
+        await load();
       } catch (error) {
         notify(error);
       }
       button.disabled = false;
     };
-    button.hidden = !has(known());
-    if (button.hidden) void api.products(parts.id).then((all) => (button.hidden = !all.some(({ kind }) => kind === product.kind)), notify);
+    if (button.hidden) void api.products(parts.id).then((all) => (button.hidden = !all.some((p) => p.kind === kind)), notify);
     buttons.push(button);
-  }
-  return [group(...buttons), group(measured)];
+    return { product, button, load };
+  });
+  /** Names what there is by now. A finished scan is shown as its mesh, until somebody chooses. */
+  const refresh = (): void => {
+    for (const { product: { name, has }, button } of rows) button.textContent = has(known()) ? name : `Make ${name.toLowerCase()}`;
+    const [mesh] = rows.filter(({ product }) => product.kind === "glb");
+    const isUntouched = !turn && colour.value === "colour" && cloud.isWhole && !cloud.measuredOnly && !cloud.parts.length;
+    if (isUntouched && finished() && mesh!.product.has(known()) && fits(known())) void mesh!.load().catch(notify);
+  };
+  refresh();
+  return { elements: [group(...buttons), group(measured)], refresh };
+}
+
+/** Whether a mesh is small enough to be loaded unasked: a phone has little memory. */
+function fits({ files }: api.Scan): boolean {
+  const bytes = files.find((f) => f.name === "mesh.glb")?.bytes ?? Infinity;
+  return bytes < (matchMedia("(pointer: coarse)").matches ? MAX_PHONE_BYTES : MAX_UNASKED_BYTES);
 }
 
 /** Makes a product unless it is there. */

@@ -103,8 +103,8 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   stage.addAgain(cloud.group);
   stage.add(cloud.ground.mesh);
   host.append(compass(stage));
-  const tools = toolbar({ ...site, ruler, notes, legend, coverage, time: time.element, finished: () => link.finished, known: () => known });
-  bar.append(menuOf(bar, tools), tools);
+  const tools = toolbar({ ...site, ruler, notes, legend, coverage, time, finished: () => link.finished, known: () => known });
+  bar.append(menuOf(bar, tools.element), tools.element);
   if (awaited(scan)) ruler.toggle();
 
   let last: LastPose | undefined;
@@ -150,7 +150,8 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     (text) => (link.cut = text),
   );
   const asked = api.every(ASK_EVERY_MS, async () => {
-    if (link.finished && report.hidden) learn(await api.scan(id.drone, id.scan));
+    if (link.finished && (report.hidden || !known.meshed)) learn(await api.scan(id.drone, id.scan));
+    tools.refresh();
     const scan = link.isSilent && (await newer(known));
     if (scan) linkTo(back, scan);
     else back.hidden = true;
