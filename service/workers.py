@@ -98,6 +98,7 @@ ROWS: tuple[Row, ...] = (
     Row("live site", "process: aligns scans in flight", 4, restarts=True),
     Row("exports", "deliverables asked for in the portal", 4, 20, "refuse", is_awaited=True),
     Row("replay", "process: the scan of an uploaded recording", 4),
+    Row("mesh", "process: the mesh of a scan that has ended", 4),
     Row("vehicle", "looks for the vehicle that the portal steers", 5, restarts=True),
     Row("portal", "the web server", 5, None, "", 60.0, True, True),
     Row("closing", "keeps the init system waiting while all is closed", 6, restarts=True,

@@ -94,6 +94,9 @@ class GroundOptions:
     sites: Annotated[
         bool, typer.Option(help="align finished scans that show the same ground, in STORE/site")
     ] = True
+    meshes: Annotated[
+        bool, typer.Option(help="mesh scans that have ended, to be shown in the portal")
+    ] = True
     once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False
     idle_exit_s: Annotated[
         float | None, typer.Option(help="end after so many seconds without new data")
@@ -148,19 +151,24 @@ def ground(given: GroundOptions) -> None:
     config, notifier = given.receiver(), Notifier()
     taken = _take_in(config.store, given.take or [])
     stop, workers = stop_by_signals(), Workers()
-    receiver = Receiver(config, workers)
+    page: Portal | None = None
+
+    def ended(folder: Path) -> None:
+        if page is not None:
+            page.ended(folder)
+
+    receiver = Receiver(config, workers, ended=ended)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in given.mavlink or []]
     receiver.start()
-    for folder in taken:
-        receiver.align(folder)
     where = ", ".join((*config.session.listen, *config.session.connect))
     print(f"ground station at {where}, scans in {config.store}", file=sys.stderr, flush=True)
     for radio in radios:
         radio.open()
-    page = None
     try:
         if given.portal is not None:
             page = _open_portal(given.portal, given, receiver, workers)
+        for folder in taken:
+            receiver.end(folder)
         notifier.ready()
         shown: dict[str, str] = {}
         shown_at = beat_at = 0.0
@@ -219,7 +227,7 @@ def _open_portal(
     vehicle = None if endpoint is None else Vehicle(endpoint, workers=workers)
     config = config_of(
         address, given.store, given.portal_token, given.portal_tls, basemap=given.basemap,
-        limits=receiver.limits,
+        limits=receiver.limits, meshes=given.meshes,
     )  # fmt: skip
     page = Portal(config, receiver.progress, vehicle, workers)
     page.start()

@@ -46,7 +46,7 @@ from service.ground.map_tiles import map_routes
 from service.ground.products import job_title, products_of
 from service.ground.scan_files import file_routes
 from service.ground.sites import align_by_points
-from service.ground.state import KINDS, PortalState, folder_of, names_of, state_of
+from service.ground.state import KINDS, SILENT_S, PortalState, folder_of, names_of, state_of
 from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS
 from service.offline.exports.view import ExportOptions
@@ -71,9 +71,6 @@ MAX_LIVE_VIEWS = {False: 8, True: 16}
 """Without a token, and with one. uvicorn's limit is one for all requests together."""
 ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
 """Rate limit of orders to the vehicle; a stop always passes."""
-
-SILENT_S = 10.0
-"""A scan from which nothing was heard for so long does not grow."""
 
 NO_PAGE = (
     "<!doctype html><meta charset=utf-8><title>skyrelief</title><h1>skyrelief</h1>"
@@ -378,7 +375,9 @@ def _import(request: Request, order: ImportOrder) -> Response:
     note(request, "import", folder=order.folder)
     if not order.folder or "\0" in order.folder:
         raise InputError("give the folder or the .mcap to import")
-    drone, scan = state_of(request).library.bring_in(Path(order.folder))
+    state = state_of(request)
+    drone, scan = state.library.bring_in(Path(order.folder))
+    state.ended(state.library.folder(drone, scan))
     note(request, "import", scan=f"{drone}/{scan}")
     return JSONResponse({"drone": drone, "scan": scan}, 201)
 
@@ -415,6 +414,7 @@ async def _upload(request: Request) -> Response:
             job = state.jobs.start(Path("upload") / Path(video).name[:100], "scan", upload.replay())
             return JSONResponse(job, 202)
         drone, scan = await run_in_threadpool(upload.finish)
+        state.ended(state.library.folder(drone, scan))
     except ClientDisconnect:
         raise InputError("the upload was cancelled") from None
     finally:

@@ -25,7 +25,8 @@ from service.ground.guard import (
 from service.ground.http import portal_app
 from service.ground.library import Library
 from service.ground.live_map import LiveMap
-from service.ground.state import Jobs, OpenScans, PortalState
+from service.ground.meshing import queue_mesh
+from service.ground.state import REFINE, Job, Jobs, OpenScans, PortalState
 from service.ground.vehicle import Vehicle
 from service.listener import (
     BoundedListener,
@@ -61,6 +62,7 @@ class PortalConfig:
     limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)  # of the disk
     map_age_s: float = 1.0  # at which the live map of a scan is made again
     coverage_age_s: float = 2.0  # the same for its coverage
+    meshes: bool = False  # make the mesh of each scan that ends
     body_s: float = 10.0  # a request's whole body must arrive within this time
     stall_s: float = 120.0  # a reader that has received nothing for so long is dropped
 
@@ -92,10 +94,11 @@ class Portal:
         self.jobs = Jobs(self._workers)
         below = None if config.basemap is None else open_basemap(config.basemap)
         library = Library(config.store)
+        self.jobs.made = self._made
         self.state = PortalState(
             library, self.jobs, progress or list, vehicle, below, config.limits,
             OpenScans(LiveCoverage, config.coverage_age_s, max_scans=4),
-            OpenScans(LiveMap, config.map_age_s, max_scans=3),
+            OpenScans(LiveMap, config.map_age_s, max_scans=3), self.ended,
         )  # fmt: skip
         tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
         self.token = next(iter(tokens.values()))
@@ -111,6 +114,18 @@ class Portal:
         scheme = "https" if self.config.tls else "http"
         host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
         return f"{scheme}://{host}:{self._port}/?token={self.token}"
+
+    def ended(self, folder: Path) -> None:
+        """Have the mesh of a scan that has ended made, once none grows; from any thread."""
+        if self.config.meshes:
+            queue_mesh(self.jobs, folder, lambda: not self.state.is_receiving)
+
+    def _made(self, job: Job) -> None:
+        """A recording has become a scan, or a scan was refined."""
+        if job.kind == "scan" and job.file is not None:
+            self.ended(self.state.library.folder(*job.file.split("/")))
+        elif job.kind == REFINE:
+            self.ended(job.folder)
 
     def start(self) -> None:
         """Begin to serve; raises OutsideError when the address cannot be used."""

@@ -81,11 +81,11 @@ def _product(folder: Path, kind: str, points: int | None, is_placed: bool) -> di
         "about_bytes": None if about is None else round(about * point_bytes),
         "about_s": None if about is None else max(round(about * 1e-6 * million_s), 1),
         "heights": has_heights,
-        "impossible": _obstacle(kind, is_placed),
+        "impossible": obstacle(kind, is_placed),
     }
 
 
-def _obstacle(kind: str, is_placed: bool) -> str | None:
+def obstacle(kind: str, is_placed: bool) -> str | None:
     """Why a product cannot be made; None where it can."""
     if kind in MAPPED and not is_placed:
         return "needs a georeference"

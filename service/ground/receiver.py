@@ -143,10 +143,13 @@ class Receiver:
         workers: Workers | None = None,
         deliver: Callable[[Path], None] = deliver,
         opened: Callable[[ReceivedScan], None] = lambda _: None,
+        ended: Callable[[Path], None] = lambda _: None,
     ) -> None:
-        """``deliver`` writes the deliverables of a scan; ``opened`` gets each that is opened."""
+        """``deliver`` writes the deliverables of a scan; ``opened`` gets each that is opened,
+        ``ended`` the folder of each that is whole."""
         check_endpoints(config.session)
         self._config, self._deliver, self._opened = config, deliver, opened
+        self._ended = ended
         try:
             config.store.mkdir(parents=True, exist_ok=True)
             self.name = config.name or station_name(config.store)
@@ -424,10 +427,11 @@ class Receiver:
         answered = partial(one.put, effect.answered)
         one.requests.append(self._take_from("replies", replies, answered))
 
-    def align(self, folder: Path) -> None:
-        """Align a finished scan with those that show the same ground, if configured."""
+    def end(self, folder: Path) -> None:
+        """A scan is whole: it is aligned with those that show the same ground, if configured."""
         if self._config.sites:
             self._sites.put(folder)
+        self._ended(folder)
 
     def _write(self, turn: int, effect: drone.Write, one: Drone | None = None) -> None:
         self._writes.put((turn, next(self._serial), effect, one))
@@ -440,4 +444,4 @@ class Receiver:
             if one is not None:
                 one.put(drone.Written(effect.scan, trouble, is_due))
             if effect.is_whole and not trouble:
-                self.align(effect.folder)
+                self.end(effect.folder)

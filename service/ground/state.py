@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import threading
 import time
@@ -28,10 +29,18 @@ from service.scans.coverage import LiveCoverage
 from service.stream.store import ScanStore
 from service.workers import Worker, Workers, guarded
 
+log = logging.getLogger(__name__)
+
 MAX_WAITING_JOBS = 20
+SILENT_S = 10.0
+"""A scan from which nothing was heard for so long does not grow."""
+
 KEPT = 100
 SHOWN_S = 86400.0
 """A job that has ended is listed for so long."""
+
+LOOK_S = 0.5
+"""How often a job that may not begin yet is looked at."""
 
 CLOSE_S = 5.0
 """Time to a running job's next step, when the station closes."""
@@ -52,6 +61,7 @@ class Job:
     queued_unix_s: float = field(default_factory=time.time)
     ended_unix_s: float | None = None
     work: Callable[[Progress], str] | None = None  # what makes it; None: its kind says
+    may_begin: Callable[[], bool] | None = None  # of one that nobody asked for
     options: ExportOptions = field(default_factory=ExportOptions)
     progress: Progress = field(default_factory=Progress)
 
@@ -107,6 +117,8 @@ class Jobs:
         """``carry_out`` makes a job's deliverable; an ended job is listed for ``shown_s``."""
         self._workers, self._shown_s = workers, shown_s
         self.carry_out = carry_out
+        self.made: Callable[[Job], None] = lambda _: None
+        """Called with each job that has made something."""
         self._worker: Worker | None = None  # while jobs wait
         self._lock = threading.Lock()
         self._jobs: list[Job] = []  # replaced, not changed, so that anybody may iterate over it
@@ -118,23 +130,26 @@ class Jobs:
         kind: str,
         work: Callable[[Progress], str] | None = None,
         options: ExportOptions | None = None,
+        may_begin: Callable[[], bool] | None = None,
     ) -> dict[str, Any]:
         """Queue a job, or ``work``; the one there is where it is asked for twice.
 
-        InputError for an unknown kind or a full queue.
+        With ``may_begin`` nobody asks for it: it begins when that is true and nothing else waits,
+        and is forgotten if it fails. InputError for an unknown kind or a full queue.
         """
         if work is None and kind not in KINDS:
             raise InputError(f"kind is one of {', '.join(KINDS)}")
         options = options or ExportOptions()
         asked = (folder, kind, options)
         with self._lock:
-            for job in self._jobs if work is None else ():
+            for job in self._jobs if work is None or may_begin else ():
                 if not job.has_ended and (job.folder, job.kind, job.options) == asked:
+                    job.may_begin = job.may_begin and may_begin
                     return job.shown()
             if sum(not job.has_ended for job in self._jobs) >= MAX_WAITING_JOBS:
                 raise InputError("too many deliverables are waiting; try again later")
             self._number += 1
-            job = Job(self._number, folder, kind, work=work, options=options)
+            job = Job(self._number, folder, kind, work=work, may_begin=may_begin, options=options)
             self._jobs = [*self._jobs[-KEPT:], job]
             if self._worker is None or self._worker.is_done:
                 self._worker = self._workers.start("exports", self._work)
@@ -150,7 +165,9 @@ class Jobs:
         return [j.shown() for j in self._jobs if (j.ended_unix_s or since) >= since]
 
     def busy(self, folder: Path) -> bool:
-        return any(job.folder == folder and not job.has_ended for job in self._jobs)
+        """Whether a job of a scan runs, or one that was asked for waits."""
+        of_it = (job for job in self._jobs if job.folder == folder and not job.has_ended)
+        return any(job.state == "running" or job.may_begin is None for job in of_it)
 
     def cancel(self, number: int) -> dict[str, Any]:
         """Take a waiting job off the queue, or stop a running one at its next step.
@@ -177,16 +194,28 @@ class Jobs:
         if worker is not None:
             worker.join(CLOSE_S)
 
-    def _work(self, _: Worker) -> None:
+    def _work(self, worker: Worker) -> None:
         while True:
             with self._lock:
-                job = next((j for j in self._jobs if j.state == "waiting"), None)
-                if job is None:
+                waiting = [job for job in self._jobs if job.state == "waiting"]
+                if not waiting:
                     self._worker = None
                     return
-                job.state = "running"
+                waiting.sort(key=lambda job: job.may_begin is not None)  # what is asked for first
+                job = next((j for j in waiting if j.may_begin is None or j.may_begin()), None)
+                if job is not None:
+                    job.state = "running"
+            if job is None:
+                worker.stop.wait(LOOK_S)
+                continue
             job.progress.begin()
             guarded("exports", partial(self._run, job))
+            if job.state == "failed" and job.may_begin is not None:
+                log.info("%s of %s: %s", job.kind, job.folder, job.error)
+                with self._lock:
+                    self._jobs = [one for one in self._jobs if one is not job]
+            elif job.state == "done":
+                self.made(job)
 
     def _run(self, job: Job) -> None:
         try:
@@ -268,6 +297,8 @@ class PortalState:
     limits: DroneLimits  # of the disk
     coverages: OpenScans[LiveCoverage]
     maps: OpenScans[LiveMap]
+    ended: Callable[[Path], None] = lambda _: None
+    """Takes note of a finished scan that came; from any thread."""
     live_views: Counter[bool] = field(default_factory=Counter)  # without a token, and with one
     decoding: asyncio.Semaphore = field(init=False)
     """Recordings opened at a time; who waits holds no thread."""
@@ -277,6 +308,14 @@ class PortalState:
         """The receiver's report about a scan; empty when it does not receive it."""
         names = (drone, scan)
         return next((e for e in self.progress() if (e["drone"], e["scan"]) == names), {})
+
+    @property
+    def is_receiving(self) -> bool:
+        """Whether any scan grows: one that has not ended, and was heard of lately."""
+        since = time.time() - SILENT_S
+        return any(
+            not e.get("finished") and e.get("heard_unix_s", 0) > since for e in self.progress()
+        )
 
 
 def state_of(connection: HTTPConnection) -> PortalState:

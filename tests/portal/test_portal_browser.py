@@ -133,10 +133,59 @@ def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
         "(s => `${s.disabled} ${s.value}`)(document.querySelector('[aria-label=\"colour by\"]'))"
     )
     time_shown = "document.querySelector('.time').checkVisibility()"
-    assert browser.run(f"[{colour}, {time_shown}]") == ["true colour", False]  # of the points
+    assert browser.run(f"[{colour}, {time_shown}]") == ["false colour", True]  # a mesh has no other
     browser.click("Points")
     browser.wait("!document.body.dataset.mesh")
     assert browser.run(f"[{colour}, {time_shown}]") == ["false height", True]
+
+
+PRESSED = "[...document.querySelectorAll('.tools button.on')].map(b => b.textContent).join()"
+SLIDE = """(() => {
+  const input = document.querySelector('.time input'); input.value = '%d'; input.oninput();
+})()"""
+
+
+def test_a_finished_scan_opens_as_its_mesh(browser: Browser, portal: Portal, scans: Path) -> None:
+    """Time, figures and what was measured alone are of the depth images: these are shown then."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    folder = scans / "drone-1/test-1"
+    with ScanStore.open(folder / "scan.db") as store:
+        store.finish({})
+        write_deliverables(folder, store, {})
+    browser.open("about:blank")
+    browser.wait("location.href === 'about:blank'")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait(f"{PRESSED} === 'Surface'")
+    with ScanView(folder) as scan:
+        export(scan, "glb", None, ExportOptions())
+    browser.wait(f"document.body.dataset.mesh === 'shown' && {PRESSED} === 'Mesh'", 60)  # by itself
+    browser.run(SLIDE % 2)
+    browser.wait(f"{PRESSED} === 'Surface' && !document.body.dataset.mesh")
+    figure = "document.querySelector('.figures').textContent"
+    browser.wait(f"{figure}.includes('Images2')")
+    browser.click("Mesh")
+    browser.wait("document.body.dataset.mesh === 'shown'")
+    assert browser.run("document.querySelector('.time input').value") == "5"  # a mesh is of all
+    browser.wait(f"{figure}.includes('Images5')")
+    browser.page.select_option('[aria-label="colour by"]', "height")
+    browser.wait(f"{PRESSED} === 'Surface'")
+    browser.wait("document.querySelector('.legend').checkVisibility()")
+    browser.click("Mesh")
+    browser.wait("document.body.dataset.mesh === 'shown'")
+    assert not browser.run("document.querySelector('.legend').checkVisibility()")
+    browser.click("Measured only")
+    browser.wait(f"{PRESSED} === 'Surface,Measured only'")
+    browser.click("Mesh")
+    browser.wait(f"{PRESSED} === 'Mesh'")
+    later = time.time() + 5
+    os.utime(folder / "scan.json", (later, later))
+    browser.open("about:blank")
+    browser.wait("location.href === 'about:blank'")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")  # the scan has changed: as it is now
+    browser.wait(
+        "[...document.querySelectorAll('button')].some(b => b.textContent === 'Make mesh')"
+    )
+    browser.wait(f"{PRESSED} === 'Surface'")
 
 
 def roof_red(browser: Browser) -> float:

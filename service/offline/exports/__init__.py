@@ -54,13 +54,18 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
 MAPPED = ("contours", "gpkg", "dxf", "geojson", "kml", "kmz", "stac", "3dtiles", "3dtiles-mesh")
 """Kinds that need a georeference."""
 
-PACKAGES = {
-    "copc": ("copclib",),
-    "3dtiles": ("py3dtiles",),
-    "mcap": ("foxglove",),
-    "ros2": ("rosbags", "mcap"),
-} | dict.fromkeys(
-    ("dsm", "dtm", "ortho", "coverage", "kmz", "stac", "report", "all"), ("rasterio",)
+PACKAGES = (
+    {
+        "copc": ("copclib",),
+        "3dtiles": ("py3dtiles",),
+        "mcap": ("foxglove",),
+        "ros2": ("rosbags", "mcap"),
+        "splat": ("open3d",),
+    }
+    | dict.fromkeys(
+        ("dsm", "dtm", "ortho", "coverage", "kmz", "stac", "report", "all"), ("rasterio",)
+    )
+    | dict.fromkeys(("glb", "obj", "3dtiles-mesh"), ("open3d", "trimesh", "fast_simplification"))
 )
 """Optional packages of kinds."""
 

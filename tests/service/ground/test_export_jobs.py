@@ -94,3 +94,40 @@ def test_ended_jobs_leave_the_list_after_a_while(tmp_path: Path) -> None:
     assert until(lambda: not jobs.busy(tmp_path)) and len(jobs.listed()) == 1
     assert until(lambda: not brief.busy(tmp_path))
     assert brief.listed() == [] and len(brief.of(tmp_path)) == 1
+
+
+def test_what_nobody_asked_for_waits_for_all_others(tmp_path: Path) -> None:
+    order, may_begin, go_on = list[str](), threading.Event(), threading.Event()
+
+    def carry_out(job: Job) -> str:
+        order.append(job.kind)
+        go_on.wait(10.0)
+        return "scan.kml"
+
+    jobs = Jobs(Workers(), carry_out)
+    folder = tmp_path / "drone-1" / "test-1"
+    unasked = jobs.start(folder, "glb", may_begin=may_begin.is_set)["number"]
+    assert not jobs.busy(folder)  # it may be deleted meanwhile
+    jobs.start(folder, "kml")
+    jobs.start(folder, "laz")
+    go_on.set()
+    assert until(lambda: order == ["kml", "laz"] and not jobs.busy(folder))
+    assert [job["state"] for job in jobs.of(folder)] == ["waiting", "done", "done"]
+    may_begin.set()
+    assert until(lambda: order == ["kml", "laz", "glb"])
+    assert until(lambda: jobs.of(folder)[0]["state"] == "done")
+    waiting = jobs.start(folder, "glb", may_begin=lambda: False)["number"]
+    assert waiting > unasked
+    assert jobs.start(folder, "glb")["number"] == waiting  # somebody asks: it begins
+    assert until(lambda: order[3:] == ["glb"] and not jobs.busy(folder))
+
+
+def test_what_nobody_asked_for_fails_in_silence(tmp_path: Path) -> None:
+    def carry_out(job: Job) -> str:
+        raise InputError("there is too little surface")
+
+    jobs = Jobs(Workers(), carry_out)
+    jobs.start(tmp_path, "glb", may_begin=lambda: True)
+    assert until(lambda: not jobs.listed())
+    jobs.start(tmp_path, "glb")
+    assert until(lambda: [job["state"] for job in jobs.listed()] == ["failed"])

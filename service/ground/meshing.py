@@ -1,0 +1,57 @@
+"""The mesh of a scan that has ended: made unasked, as the portal shows a finished scan by it.
+
+It waits until no scan grows and nothing that was asked for waits, and is a process of low priority.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from service.errors import InputError
+from service.ground.library import UNREADABLE
+from service.ground.products import PRODUCTS, obstacle
+from service.ground.scan_facts import facts_of, is_current
+from service.ground.state import Jobs
+from service.ground.storage import check_room
+from service.ground.upload import follow
+from service.progress import Progress
+from service.workers import python_command, run_to_end
+
+log = logging.getLogger(__name__)
+
+KIND, FILE = "glb", "mesh.glb"
+MOST_POINTS = 20_000_000
+"""A larger scan has a mesh in tiles, which one page does not hold."""
+
+
+def queue_mesh(jobs: Jobs, folder: Path, may_begin: Callable[[], bool]) -> None:
+    """Have the mesh of the finished scan in ``folder`` made once ``may_begin``; nothing happens
+    where there is one, or packages or the disk do not permit it."""
+    with contextlib.suppress(*UNREADABLE):
+        facts = facts_of(folder)
+        points = facts.get("counts", {}).get("points", 0)
+        has_place = facts["origin"] is not None
+        if not facts["finished"] or is_current(folder / FILE) or not 0 < points <= MOST_POINTS:
+            return
+        if (why := obstacle(KIND, has_place)) is None:
+            check_room(round(points * PRODUCTS[KIND][2]), folder)
+            jobs.start(folder, KIND, partial(_make, folder), may_begin=may_begin)
+        else:
+            log.info("%s gets no mesh: it %s", folder, why)
+
+
+def _make(folder: Path, progress: Progress) -> str:
+    """Run ``skyrelief mesh``; the name of its file. Raises InputError with its last line."""
+
+    def goes_on(line: str) -> bool:
+        follow(progress, line.removeprefix("mesh: "))
+        return True
+
+    fault = run_to_end("mesh", python_command("service.cli", "mesh", str(folder)), goes_on)
+    if fault:
+        raise InputError(fault)
+    return FILE

@@ -1,0 +1,82 @@
+"""The mesh of a scan that has ended is made unasked, once no scan grows."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from house_flight import HouseFlight
+from loopback import until
+from portal_client import TOKEN, flown_store
+
+from service.ground.portal import Portal, PortalConfig
+from service.scans.folder import write_deliverables
+from service.stream.store import ScanStore
+
+pytest.importorskip("open3d", exc_type=ImportError)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, house: HouseFlight) -> Path:
+    """A finished scan in a library."""
+    folder = flown_store(tmp_path / "scans", house) / "drone-1/test-1"
+    with ScanStore.open(folder / "scan.db") as store:
+        store.finish({})
+        write_deliverables(folder, store, {})
+    return folder
+
+
+def portal_of(folder: Path, growing: list[dict[str, Any]], **options: Any) -> Portal:
+    config = PortalConfig(folder.parents[1], port=0, token=TOKEN, **options)
+    return Portal(config, lambda: growing)
+
+
+def test_a_scan_that_has_ended_gets_its_mesh_when_no_other_grows(folder: Path) -> None:
+    other = {"drone": "drone-2", "scan": "b", "finished": False, "heard_unix_s": time.time() + 60}
+    growing = [other]
+    portal = portal_of(folder, growing, meshes=True)
+    try:
+        portal.ended(folder)
+        portal.ended(folder)
+        time.sleep(1.2)
+        assert portal.jobs.of(folder)[0]["state"] == "waiting"
+        growing.clear()
+        assert until(lambda: portal.jobs.of(folder)[0]["state"] != "waiting", 10)
+        assert until(lambda: not portal.jobs.busy(folder), 60)
+        (job,) = portal.jobs.of(folder)
+        assert (job["state"], job["file"]) == ("done", "mesh.glb")
+        assert portal.state.library.entry("drone-1", "test-1")["meshed"]
+        portal.ended(folder)  # it has one
+        assert len(portal.jobs.of(folder)) == 1
+        later = time.time() + 5
+        os.utime(folder / "scan.json", (later, later))  # the scan has changed
+        assert not portal.state.library.entry("drone-1", "test-1")["meshed"]
+        growing.append(other)
+        portal.ended(folder)
+        assert [job["state"] for job in portal.jobs.of(folder)] == ["done", "waiting"]
+    finally:
+        portal.close()
+
+
+def test_nothing_is_made_where_nobody_wants_it_or_it_does_not_fit(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = portal_of(folder, [])
+    plain.ended(folder)
+    assert not plain.jobs.of(folder)
+    portal = portal_of(folder, [], meshes=True)
+    for name, value in (("MOST_POINTS", 10), ("obstacle", lambda *_: "needs the package open3d")):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"service.ground.meshing.{name}", value)
+            portal.ended(folder)
+        assert not portal.jobs.of(folder)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: FullDisk())
+    portal.ended(folder)
+    assert not portal.jobs.of(folder)
+
+
+class FullDisk:
+    free, total = 1000, 10**12
