@@ -31,7 +31,6 @@ class Notifier:
 
     @property
     def is_heard(self) -> bool:
-        """True when an init system listens."""
         return self._socket is not None
 
     def status(self, text: str) -> None:

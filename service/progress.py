@@ -129,7 +129,6 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Time the block as ``stage``."""
         start = time.perf_counter()
         try:
             yield
@@ -138,5 +137,4 @@ class Stopwatch:
             self.calls[stage] = self.calls.get(stage, 0) + 1
 
     def mean_ms(self) -> dict[str, float]:
-        """Stage to mean milliseconds per call."""
         return {s: 1e3 * t / self.calls[s] for s, t in self.seconds.items()}

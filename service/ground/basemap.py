@@ -72,8 +72,6 @@ def tile_px(data: bytes) -> tuple[int, int]:
 
 
 class MBTiles:
-    """A file after the MBTiles specification."""
-
     def __init__(self, path: Path) -> None:
         self._uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
         with closing(self._open()) as database:
@@ -106,8 +104,6 @@ class MBTiles:
 
 
 class PMTiles:
-    """A file after the PMTiles specification, version 3."""
-
     def __init__(self, path: Path) -> None:
         self._path, self._size = path, path.stat().st_size
         head = PM_HEADER.unpack(self._read(0, PM_HEADER.size))

@@ -101,7 +101,6 @@ class Front:
         server.close()
 
     async def _pass(self, listener: BoundedListener, outer: Stream) -> None:
-        """Pass the bytes of one connection until an end closes it."""
         peer: Peer = (outer[1].get_extra_info("peername") or ("", 0))[:2]
         loop, network = asyncio.get_running_loop(), network_of(peer[0])
         first = await outer[0].read(BLOCK_BYTES)

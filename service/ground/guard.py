@@ -215,7 +215,6 @@ def note(connection: HTTPConnection, action: str, **details: Any) -> None:
 
 
 def _short(value: Any) -> Any:
-    """``value`` as a line of the log holds it."""
     if value is None or isinstance(value, (bool, int, float)):
         return value
     if isinstance(value, (list, tuple)):

@@ -222,7 +222,6 @@ CODES = {MissingError: 404, ConflictError: 409, OutsideError: 503}
 
 
 def _said(request: HTTPConnection, error: Exception) -> Response:
-    """An error as JSON."""
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
     status = next((code for kind, code in CODES.items() if isinstance(error, kind)), 400)

@@ -195,7 +195,6 @@ class ScanIntake:
     # What to say
 
     def held(self) -> Held:
-        """The report for the drone."""
         return Held(self.store.numbers(), self.received_bytes)
 
     def missing(self) -> Numbers:

@@ -143,8 +143,6 @@ Matrix = Annotated[list[Number], msgspec.Meta(min_length=16, max_length=16)]
 
 
 class Shown(msgspec.Struct):
-    """One scan in the site."""
-
     drone: str
     scan: str
     started_unix_s: UnixTime

@@ -178,7 +178,6 @@ class _Track:
         self._flown_m = 0.0
 
     def add(self, time_ns: int, pose: Any, fix: Any) -> None:
-        """A pose with its fix, if there is one."""
         T = _transform(pose.pose)
         if T is None:
             return
@@ -372,7 +371,6 @@ def _unpacked(chunk: Any) -> bytes:
 
 @cache
 def _classes() -> dict[str, Any]:
-    """Message classes of FIELDS."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     file = descriptor_pb2.FileDescriptorProto(name="scan.proto", package="scan", syntax="proto3")

@@ -58,8 +58,6 @@ def _quieten() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """The answer to a command, and its sender."""
-
     system: int
     component: int
     result: int

@@ -51,8 +51,6 @@ BACKLOG = 64
 
 @dataclass(frozen=True, slots=True)
 class PortalConfig:
-    """The portal's address, scans and secrets."""
-
     store: Path
     host: str = "127.0.0.1"
     port: int = 8080
@@ -199,7 +197,6 @@ class Portal:
 
 
 def _few_warnings(record: logging.LogRecord) -> bool:
-    """Lets through few warnings; errors all."""
     return record.levelno > logging.WARNING or _warnings_pace.take()
 
 

@@ -203,7 +203,6 @@ def _is_same_visit(a: Ground, b: Ground) -> bool:
 
 
 def _is_shared(a: Ground, b: Ground) -> bool:
-    """True for scans whose extents overlap."""
     if a.box is None or b.box is None:
         return False
     common, areas = 1.0, [1.0, 1.0]

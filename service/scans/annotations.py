@@ -33,8 +33,6 @@ Number = Annotated[int, msgspec.Meta(ge=1, le=2**53)]
 
 
 class Point(msgspec.Struct, forbid_unknown_fields=True, tag_field="type", tag="Point"):
-    """A place in GeoJSON."""
-
     coordinates: Spot
 
 
@@ -43,8 +41,6 @@ Line = Annotated[list[Spot], msgspec.Meta(min_length=2, max_length=MAX_PLACES)]
 
 
 class LineString(msgspec.Struct, forbid_unknown_fields=True, tag_field="type", tag="LineString"):
-    """The places of a measurement in GeoJSON."""
-
     coordinates: Line
 
 
@@ -126,5 +122,4 @@ def _write(folder: Path, known: Annotations) -> None:
 
 
 def as_json(document: Annotation | Annotations) -> Any:
-    """The GeoJSON of one or all."""
     return msgspec.to_builtins(document)

@@ -44,8 +44,6 @@ HEADER_BYTES = _LAYER.size
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayerHead:
-    """The header of one layer."""
-
     layer: int  # 0 is the coarsest
     layers: int
     seq: int

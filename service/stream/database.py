@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from functools import cache
 from pathlib import Path
@@ -61,26 +62,11 @@ OUTSIDE = (
 """Words in SQLite's messages that indicate a disk failure, not a damaged file."""
 
 
-class Deadline:
-    """Aborts statements of one connection that take too long."""
-
-    def __init__(self, connection: sqlite3.Connection, size_bytes: int, statement_s: float) -> None:
-        self._allowed_s = statement_s + size_bytes / SLOWEST_BYTES_S
-        self._end_s = time.monotonic() + self._allowed_s
-        connection.set_progress_handler(self._is_over, STEPS)
-
-    def start(self) -> None:
-        """Start the time limit of the next statement."""
-        self._end_s = time.monotonic() + self._allowed_s
-
-    def _is_over(self) -> bool:
-        return time.monotonic() > self._end_s
-
-
 def connect(
     path: Path, read_only: bool = False, statement_s: float = STATEMENT_S
-) -> tuple[sqlite3.Connection, Deadline]:
-    """A connection that trusts nothing in the file. Raises sqlite3.Error."""
+) -> tuple[sqlite3.Connection, Callable[[], None]]:
+    """A connection that trusts nothing in the file, and what starts the time limit of its next
+    statement. Raises sqlite3.Error."""
     mode = "ro" if read_only else "rwc"
     try:
         connection = _opened(path, f"mode={mode}")
@@ -89,8 +75,16 @@ def connect(
         if not read_only or (wal.exists() and wal.stat().st_size > 0):  # it holds data
             raise
         connection = _opened(path, "immutable=1")  # a disk that cannot even hold locks
-    size_bytes = path.stat().st_size if path.exists() else 0
-    return connection, Deadline(connection, size_bytes, statement_s)
+    allowed_s = statement_s + (path.stat().st_size if path.exists() else 0) / SLOWEST_BYTES_S
+    end_s = 0.0
+
+    def start() -> None:
+        nonlocal end_s
+        end_s = time.monotonic() + allowed_s
+
+    start()
+    connection.set_progress_handler(lambda: time.monotonic() > end_s, STEPS)
+    return connection, start
 
 
 def _opened(path: Path, how: str) -> sqlite3.Connection:
@@ -207,7 +201,7 @@ class Database:
         self.read_only = read_only or not can_write(path)
         try:
             with ExitStack() as on_fault:
-                self._connection, self._deadline = connect(path, self.read_only, statement_s)
+                self._connection, self._start = connect(path, self.read_only, statement_s)
                 on_fault.callback(self._connection.close)
                 check_schema(self._connection, path)
                 if not self.read_only:
@@ -221,7 +215,6 @@ class Database:
             raise as_error(path, error) from error
 
     def one(self, sql: str, values: tuple[Any, ...] = ()) -> tuple[Any, ...] | None:
-        """The first row of a query."""
         rows = self.all(sql, values)
         return rows[0] if rows else None
 
@@ -229,7 +222,7 @@ class Database:
         """All rows of a query. Raises OutsideError when the file cannot be read."""
         try:
             with self.lock:
-                self._deadline.start()
+                self._start()
                 rows = self._connection.execute(sql, values).fetchall()
                 self.uses[threading.get_ident()] += 1
                 return rows
@@ -247,7 +240,7 @@ class Database:
         Raises OutsideError when the disk is full or fails; then nothing is changed.
         """
         with self.lock:
-            self._deadline.start()
+            self._start()
             before = self._connection.total_changes
             if not os.path.exists(self.path):  # SQLite goes on with a file that has no name
                 raise OutsideError(f"cannot write {self.path} (the file is gone); check the disk")
@@ -274,7 +267,7 @@ class Database:
         """Merge the write-ahead log into the file and close it."""
         with self.lock:
             try:
-                self._deadline.start()
+                self._start()
                 if not self.read_only:
                     self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             except sqlite3.Error as error:

@@ -44,7 +44,6 @@ class Fleet:
         return [(role, name) for role, names in self.members.items() for name in names]
 
     def with_members(self, role: str, names: Sequence[str]) -> Fleet:
-        """The fleet with more members of a role."""
         merged = tuple(sorted({*self.members.get(role, ()), *names}))
         return Fleet({**self.members, role: merged}, self.revoked)
 

@@ -59,8 +59,6 @@ PRIORITIES = ("REAL_TIME", "INTERACTIVE_HIGH", "DATA_HIGH", "DATA", "DATA_LOW", 
 
 @dataclass(frozen=True, slots=True)
 class LinkProgress:
-    """Progress of the datalink with the scans it offers."""
-
     connected: bool  # a session is open
     listened: bool  # a ground station was heard recently
     items: int  # items in the stores: poses, layers …
@@ -167,7 +165,6 @@ class DatalinkSender:
 
     @property
     def progress(self) -> LinkProgress:
-        """The present state."""
         with self._lock:
             items = 0
             lacking: dict[str, int] = {}

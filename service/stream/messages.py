@@ -56,8 +56,6 @@ WHOLE = ("header", "summary")
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of a record."""
-
     kind: str
     number: int
     index: int
@@ -126,8 +124,6 @@ def _size_of(index: int, count: int, total: int) -> int:
 
 @dataclass(slots=True)
 class _Open:
-    """A record in progress."""
-
     cut: tuple[int, int, int]  # count of parts, bytes and CRC of the record
     pieces: dict[int, bytes] = field(default_factory=dict)
     held_bytes: int = 0

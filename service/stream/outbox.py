@@ -37,8 +37,6 @@ MAX_ASKED = 512
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outgoing:
-    """One message for the link."""
-
     scan_id: str
     topic: str  # "head", or "item/<kind>/<numbers>"
     payload: bytes
@@ -65,7 +63,6 @@ class LiveLane:
         self.skipped = 0  # dropped items
 
     def push(self, store: ScanStore, kind: str, number: int) -> None:
-        """Add a new item at the front."""
         self._queue.append((store, kind, number))
         while len(self._queue) > self._room:
             self._queue.popleft()
@@ -145,7 +142,6 @@ class AskedLane:
         return replaced
 
     def peek(self, part_bytes: int) -> Outgoing | None:
-        """The next message, or None."""
         while not self._messages and self._turn:
             request = self._turn.popleft()
             parts = self._some(request, part_bytes)
@@ -162,7 +158,6 @@ class AskedLane:
         return self._messages[0] if self._messages else None
 
     def pop(self) -> None:
-        """Remove the message that :meth:`peek` returned."""
         self._messages.popleft()
 
     def _some(self, request: Request, part_bytes: int) -> list[Part]:
@@ -231,7 +226,6 @@ class _Feed:
     answered_bytes: dict[str, int] = field(default_factory=dict)  # and to each on request
 
     def count(self, message: Outgoing) -> None:
-        """Count a message of items that is being sent."""
         size, answered = len(message.payload), self.answered_bytes
         if message.peer:
             answered[message.peer] = answered.get(message.peer, 0) + size
@@ -324,7 +318,6 @@ class Outbox:
             feed.answered_bytes.clear()
 
     def forget_requests(self) -> None:
-        """Drop all requests, and their tokens."""
         self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
 
     def set_rate(self, rate_bytes_s: float, now: float) -> None:

@@ -140,7 +140,6 @@ class RadioStore:
         return {row[0] for row in self._db.all(sql)}
 
     def poses(self) -> list[PoseRecord]:
-        """The poses in the order of their numbers."""
         rows = self._db.all("SELECT data FROM radio WHERE kind = 'pose' ORDER BY number")
         found = [unpack_pose(blob(row[0])) for row in rows]
         return [message[2] for message in found if message is not None]

@@ -55,7 +55,6 @@ class RangeSet:
             self._flip(number)
 
     def discard(self, number: int) -> None:
-        """Remove ``number`` if present."""
         if number in self:
             self._flip(number)
 
@@ -216,7 +215,6 @@ class Inventory:
         return self._reposes if kind == "repose" else self.of(kind)
 
     def note(self, kind: str, number: int) -> None:
-        """Add an item and notify the listeners."""
         self.of(kind).add(number)
         self.tell(kind, number)
 

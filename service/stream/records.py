@@ -189,7 +189,6 @@ class Placed:
     def pack(
         self, first: Sequence[Any], T: F64, covariance: F64, last: Sequence[Any], body: bytes = b""
     ) -> bytes:
-        """The record."""
         sealed = self._first.pack(self._start, *first)
         sealed += _PLACE.pack(*pack_motion(T), *pack_covariance(covariance))
         sealed += self._last.pack(*last)
@@ -225,7 +224,6 @@ def or_none(value: float) -> float | None:
 
 
 def pack_pose(pose: PoseRecord) -> bytes:
-    """``pose`` in the format of wire and store."""
     seq = -1 if pose.keyframe_seq is None else pose.keyframe_seq
     place = map(or_nan, (pose.lat_deg, pose.lon_deg, pose.alt_amsl_m, pose.agl_m))
     angles = pose.roll_rad, pose.pitch_rad, pose.yaw_rad
@@ -257,7 +255,6 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
 
 
 def pack_repose(repose: Repose) -> bytes:
-    """``repose`` in the format of wire and store."""
     return _REPOSE.pack(
         (0, repose.seq, repose.revision), repose.T_world_camera, repose.covariance, (repose.scale,)
     )

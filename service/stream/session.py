@@ -94,7 +94,6 @@ def open_session(config: SessionConfig) -> zenoh.Session:
 
 
 def zenoh_config(config: SessionConfig) -> zenoh.Config:
-    """The Zenoh settings for ``config``."""
     import zenoh
 
     settings: dict[str, Any] = {

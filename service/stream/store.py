@@ -181,7 +181,6 @@ class ScanStore:
 
     @property
     def finished(self) -> bool:
-        """True once the drone closed the scan."""
         return self.database.get("summary") is not None
 
     def finish(self, summary: dict[str, Any]) -> None:

@@ -67,7 +67,6 @@ class TunnelSender:
         self._again: deque[_Waiting] = deque(maxlen=MAX_WAITING)
 
     def on_item(self, kind: str, number: int) -> None:
-        """The store has a new item."""
         if kind == "header":
             self._announcement = radio_messages.pack_announce(self._store.header)
             self._announce_at = -math.inf
@@ -215,7 +214,6 @@ class RadioSender:
         return not self._events and self._tunnel.all_sent
 
     def close(self) -> None:
-        """Stop sending."""
         self._worker.join(5.0)
         self._store.unlisten(self._on_item)
         self._carrier.close()
