@@ -52,9 +52,6 @@ V4L2_OPTIONS = ("video_size", "framerate", "input_format")
 
 OPEN_S = 10.0
 
-CHANGED_NS = 1_000_000_000
-"""Images of another shape that come for this long are no fault of the stream."""
-
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
 """The last one: open the stream at once, without waiting some twenty images for its rate."""
 
@@ -81,6 +78,7 @@ class LiveConfig:
 
     stall_s: float = 3.0  # no image for this long: reopen
     frozen_s: float = 8.0  # the same image for this long: reopen
+    changed_s: float = 1.0  # images of another shape for this long: no fault of the stream
     first_retry_s: float = 0.25
     longest_retry_s: float = 5.0
 
@@ -197,7 +195,7 @@ class LiveSource(CameraSource):
             if fitting is None:
                 if odd_px != self._given_px:
                     odd_ns, odd_px = time_ns, self._given_px
-                if time_ns - odd_ns >= CHANGED_NS:
+                if time_ns - odd_ns >= 1e9 * self.config.changed_s:
                     self._next = image, time_ns
                     return
                 continue

@@ -17,6 +17,7 @@ from starlette.routing import Route
 
 from recon.types import Keyframe
 from service.errors import InputError, MissingError
+from service.georeference import line_geometry
 from service.ground.live import FlightPath
 from service.ground.state import folder_of, names_of, state_of
 from service.ground.storage import is_regular
@@ -176,8 +177,7 @@ def _track(request: Request) -> Response:
     if frame is None:
         raise MissingError("no track on a map: the scan has no georeference")
     places = frame.to_geodetic(np.array(path.places(), np.float64).reshape(-1, 3))
-    line = np.round(places[:, [1, 0, 2]], 8).tolist()
-    geometry = {"type": "LineString", "coordinates": line} if len(line) > 1 else None
+    geometry = line_geometry(places[:, [1, 0, 2]]) if len(places) > 1 else None
     document = {"type": "Feature", "properties": {}, "geometry": geometry}
     return Response(json.dumps(document), media_type="application/geo+json")
 

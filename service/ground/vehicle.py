@@ -21,7 +21,6 @@ BUTTONS = ("start", "stop", "pause", "resume", "photo", "baseline")
 
 SEARCH_S = 5.0
 STALE_S = 10.0
-EARTH_M = 6_371_000.0
 HEARD = ("SYS_STATUS", "GPS_RAW_INT", "VFR_HUD", "ATTITUDE", "GLOBAL_POSITION_INT", "HOME_POSITION")
 """Messages kept for the figures."""
 
@@ -138,12 +137,13 @@ def _scaled(fields: dict[str, Any], name: str, unit: float) -> float | None:
 
 
 def _home_distance(place: dict[str, Any], home: dict[str, Any]) -> float | None:
-    """Metres over ground from home, on a sphere: right to half a percent."""
+    """Metres over ground from home."""
+    from pyproj import Geod
+
     lat, lon = _number(place, "lat"), _number(place, "lon")
     home_lat, home_lon = _number(home, "latitude"), _number(home, "longitude")
     if lat is None or lon is None or home_lat is None or home_lon is None:
         return None
-    north = math.radians((lat - home_lat) * 1e-7)
-    turned = ((lon - home_lon) * 1e-7 + 180.0) % 360.0 - 180.0
-    east = math.radians(turned) * math.cos(math.radians(lat * 1e-7))
-    return round(EARTH_M * math.hypot(north, east), 1)
+    ends = (value * 1e-7 for value in (home_lon, home_lat, lon, lat))
+    metres = Geod(ellps="WGS84").inv(*ends)[2]
+    return round(metres, 1) if math.isfinite(metres) else None

@@ -276,7 +276,7 @@ class _Files:
                 )
                 self._write_image(THUMBNAIL, drawing.draw_thumbnail(self._raster, bounds), WEBP)
         with self.failures.noted(REPORT):
-            shown = stages_jpg(self._folder, self._store)
+            shown = middle_stages(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage
             page = report_html(summary, poses, cloud, self._raster, coverage, shown, maps)
             write_whole(self._folder / REPORT, page)
@@ -321,14 +321,13 @@ class Failures:
             log.log(level, "%s is not written: %s", self._folder / name, why, exc_info=not known)
 
 
-def stages_jpg(folder: Path, store: ScanStore) -> bytes | None:
-    """JPEG of a keyframe's stages for the report; None for a scan without keyframes."""
+def middle_stages(folder: Path, store: ScanStore) -> U8 | None:
+    """Image of a keyframe's stages for the report; None for a scan without keyframes."""
     seq = drawing.middle_keyframe(folder, store, main_seqs(store))
     keyframe = None if seq is None else store.keyframe(seq)
     if keyframe is None:
         return None
-    image, _ = drawing.stages(folder, store.header.scan_id, keyframe)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return drawing.stages(folder, store.header.scan_id, keyframe)[0]
 
 
 def resolution_m(header: ScanHeader) -> float | None:

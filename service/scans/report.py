@@ -24,7 +24,7 @@ from service.scans.coverage import Coverage
 from service.scans.drawing import Maps, draw_maps
 from service.scans.report_appendix import appendix
 from service.scans.report_map import map_figure
-from service.scans.report_parts import area, figure, height_sigma_m, length, table, within
+from service.scans.report_parts import area, embedded, figure, height_sigma_m, length, table, within
 from service.stream.records import PoseRecord
 
 STYLE = (
@@ -52,13 +52,13 @@ def report_html(
     cloud: PointCloud,
     raster: Raster | None,
     coverage: Coverage | None = None,
-    keyframe_jpg: bytes | None = None,
+    keyframe: U8 | None = None,
     maps: Maps | None = None,
 ) -> str:
     """The report of a scan whose scan.json holds ``summary``.
 
     ``raster`` is its upper surface in metres about its origin, and ``maps`` show that, or
-    orthophoto and surface model; ``keyframe_jpg`` shows the stages of one keyframe.
+    orthophoto and surface model; ``keyframe`` shows the stages of one keyframe.
     """
     cover, colour, heights = _map_pages(summary, maps)
     flown = _above_ground(poses, raster)
@@ -83,7 +83,7 @@ def report_html(
             ["<h2>Orthophoto</h2>", *colour], ["<h2>Surface model</h2>", *heights]
         ) if colour),
         ("", ["<h2>Appendix: diagnostics</h2>", *appendix(summary, poses, cloud, raster,
-              keyframe_jpg), *(f"<p>Note: {escape(str(note))}</p>" for note in summary["notes"]),
+              keyframe), *(f"<p>Note: {escape(str(note))}</p>" for note in summary["notes"]),
               f"<p>{escape(summary['software'])}</p>"]),
     ]  # fmt: skip
     body = "".join(
@@ -121,12 +121,8 @@ def _map_pages(
         (colour, f"From above, with the flight path; {cell}."),
         (heights, f"Heights in {summary['heights']}, over shaded relief; {cell}."),
     )
-    cover, ortho, surface = ([figure(_jpeg(i), "image/jpeg", words)] for i, words in pages)
+    cover, ortho, surface = ([figure(embedded(i), words)] for i, words in pages)
     return cover, ortho, surface
-
-
-def _jpeg(image: U8) -> bytes:
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 
 def _cover(

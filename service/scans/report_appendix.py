@@ -15,7 +15,7 @@ from recon.types import F32, U8, PointCloud
 from service.scans.drawing import coloured, round_length
 from service.scans.fused_cloud import CHUNK_POINTS
 from service.scans.report_map import loop_pairs
-from service.scans.report_parts import figure, table
+from service.scans.report_parts import embedded, figure, table
 from service.stream.records import PoseRecord
 
 LARGEST_MAP_PX = 900
@@ -47,9 +47,9 @@ def appendix(
     poses: Sequence[PoseRecord],
     cloud: PointCloud,
     raster: Raster | None,
-    keyframe_jpg: bytes | None = None,
+    keyframe: U8 | None = None,
 ) -> list[str]:
-    """Sections as HTML; ``keyframe_jpg`` shows the stages of one keyframe."""
+    """Sections as HTML; ``keyframe`` shows the stages of one keyframe."""
     run = summary["run"]
     return [
         *_maps(cloud, raster),
@@ -57,7 +57,7 @@ def appendix(
         *consistency(summary, poses),
         "<h3>The flight over time</h3>",
         *_curves(poses),
-        *_stages(keyframe_jpg),
+        *_stages(keyframe),
         "<h3>Speeds and faults</h3>",
         table(_rows(run, SPEEDS)),
         _counted("Not used for stereo", run.get("refusals")),
@@ -96,11 +96,11 @@ def sensor_constants(graph: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _stages(image: bytes | None) -> list[str]:
+def _stages(image: U8 | None) -> list[str]:
     if image is None:
         return []
     words = "Stages of a keyframe in the middle; all of them with scan.keep_debug=true."
-    return ["<h3>A keyframe</h3>", figure(image, "image/jpeg", words)]
+    return ["<h3>A keyframe</h3>", figure(embedded(image, quality=85), words)]
 
 
 def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
@@ -118,7 +118,7 @@ def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
     ):
         panel = coloured(title, values, unit, colours)
         scale = _colour_bar(colours, *panel.ends) if panel.ends else ": no data"
-        out.append(figure(_png(panel.image), "image/png", title, scale))
+        out.append(figure(embedded(panel.image, "png"), title, scale))
     return out
 
 
@@ -206,10 +206,6 @@ def _counted(title: str, values: Any) -> str:
     if not isinstance(values, dict) or not values:
         return ""
     return f"<h4>{escape(title)}</h4>" + table([(str(k), str(v)) for k, v in values.items()])
-
-
-def _png(image: U8) -> bytes:
-    return cv2.imencode(".png", image)[1].tobytes()
 
 
 def consistency(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[str]:

@@ -7,6 +7,10 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
+import cv2
+
+from recon.types import U8
+
 
 def area(value_m2: float) -> str:
     """Such as ``10,546 m²``."""
@@ -43,8 +47,14 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
     return f"<table>{head}{body}</table>"
 
 
-def figure(data: bytes, kind: str, caption: str, scale: str = "") -> str:
+def embedded(image: U8, kind: str = "jpeg", quality: int = 90) -> str:
+    """The address of an image (BGR, as PNG also BGRA) that holds its data."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
+    code = base64.b64encode(cv2.imencode(f".{kind}", image, options)[1].tobytes())
+    return f"data:image/{kind};base64,{code.decode()}"
+
+
+def figure(address: str, caption: str, scale: str = "") -> str:
     """An image and its caption; ``scale`` is HTML at the end of it."""
-    code = base64.b64encode(data).decode("ascii")
-    image = f'<img alt="" src="data:{kind};base64,{code}">'
-    return f"<figure>{image}<figcaption>{escape(caption)}{scale}</figcaption></figure>"
+    words = f"<figcaption>{escape(caption)}{scale}</figcaption>"
+    return f'<figure><img alt="" src="{address}">{words}</figure>'

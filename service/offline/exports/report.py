@@ -14,7 +14,7 @@ from service.offline.exports.rasters import NODATA_M, enu_map, open_map, over, w
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.tiles import box_around
 from service.scans.coverage import coverage_of
-from service.scans.folder import stages_jpg, surface
+from service.scans.folder import middle_stages, surface
 from service.scans.report import maps_of, report_html
 from service.scans.writing import SUMMARY, write_whole
 
@@ -34,7 +34,7 @@ def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
         made = made_maps(folder, scan.flown_frame, summary["heights"])
         scan.progress("maps of the cloud; export ortho and dsm first" if made is None else "report")
         cloud, raster, coverage = scan.fused.cloud, surface(scan.fused), coverage_of(store)
-        shown = stages_jpg(folder, store)
+        shown = middle_stages(folder, store)
         maps = None
         if seen := made or raster:  # an orthophoto has its own light
             maps = maps_of(summary, scan.poses, seen, is_shaded=made is None)

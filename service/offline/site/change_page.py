@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterable
 from html import escape
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from recon.surface.raster import Grid, Raster, hillshade
 from recon.types import F64, U8
-from service.scans.report_parts import table
+from service.scans.report_parts import embedded, table
 
 ADDED, REMOVED = (40, 90, 230), (220, 120, 30)  # BGR
 PAGE_PX = 1400
@@ -50,8 +49,8 @@ def page(document: dict[str, Any], images: tuple[U8, U8]) -> str:
         words=escape(document["in_words"]),
         before=_utc(document["before"]["started"]),
         after=_utc(document["after"]["started"]),
-        one=_embedded(images[0]),
-        two=_embedded(images[1]),
+        one=embedded(images[0], quality=85),
+        two=embedded(images[1], quality=85),
         table=table(rows, HEAD),
         notes="".join(f"<p>{escape(note)}</p>" for note in document["notes"]),
     )
@@ -59,11 +58,6 @@ def page(document: dict[str, Any], images: tuple[U8, U8]) -> str:
 
 def _utc(iso: str) -> str:
     return iso.replace("T", " ").replace("+00:00", " UTC")
-
-
-def _embedded(image: U8) -> str:
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-    return "data:image/jpeg;base64," + base64.b64encode(data).decode()
 
 
 def drawn(raster: Raster, rows: slice, cols: slice, size: tuple[int, int]) -> U8:

@@ -16,6 +16,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -379,10 +380,10 @@ def test_images_of_another_size_are_scaled_and_of_another_shape_dropped() -> Non
     assert source.following() is None
 
 
-def test_a_shape_that_stays_is_another_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shape_that_stays_is_another_sources() -> None:
     """The connection stays: a sender that is cut off may not come again."""
-    monkeypatch.setattr(live, "CHANGED_NS", 200_000_000)
-    source = LiveSource(opener(clip(10), clip(200, (96, 64))), "test", QUICK)
+    config = replace(QUICK, changed_s=0.2)
+    source = LiveSource(opener(clip(10), clip(200, (96, 64))), "test", config)
     paced = Paced(source)
     assert {frame.image.shape for frame in paced} == {(48, 64, 3)}
     began_ns, losses = source.start_monotonic_ns, source.losses
@@ -399,15 +400,14 @@ def test_a_shape_that_stays_is_another_sources(monkeypatch: pytest.MonkeyPatch) 
     assert source.losses == losses
 
 
-def test_a_source_that_nothing_follows_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "CHANGED_NS", 0)
+def test_a_source_that_nothing_follows_is_closed() -> None:
     opened = list[RealTime]()
 
     def open_container(stall_s: float) -> Any:
         opened.append(RealTime(av.open(io.BytesIO(clip(5, (96, 64) if opened else (64, 48))))))
         return opened[-1]
 
-    paced = Paced(LiveSource(open_container, "test", QUICK))
+    paced = Paced(LiveSource(open_container, "test", replace(QUICK, changed_s=0.0)))
     assert len(list(paced)) > 0
     assert [one.is_open for one in opened] == [False, True]
     paced.close()

@@ -16,8 +16,7 @@ from loopback import until
 from onboard import FakeCamera, Onboard, camera_of
 
 from mavlink.component.control import Phase
-from service.cameras import live
-from service.cameras.live import LiveSource
+from service.cameras.live import LiveConfig, LiveSource
 from service.cameras.source import CameraFrame, Paced
 from service.daemon.frame_gate import FrameGate
 from service.daemon.resumption import MARK, Left, Resumption
@@ -79,17 +78,14 @@ def test_a_camera_model_of_another_size_is_scaled_as_by_a_replay(tmp_path: Path)
     assert scanning.fault == "" and note in daemon.vehicle.said
 
 
-def test_another_shape_of_a_live_stream_begins_another_scan(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_shape_of_a_live_stream_begins_another_scan(tmp_path: Path) -> None:
     """The first scan ends as one whose recording has ended; the camera is not opened again."""
-    monkeypatch.setattr(live, "CHANGED_NS", 200_000_000)
     opened: list[str] = []
 
     def open_camera(source: str) -> Paced:
         opened.append(source)
         parts = clip(20, (320, 240)), clip(20, (320, 180)), clip(1000, (160, 90))
-        return Paced(LiveSource(opener(*parts), "gimbal"))
+        return Paced(LiveSource(opener(*parts), "gimbal", LiveConfig(changed_s=0.2)))
 
     daemon = Onboard(tmp_path, "camera.source=srt://:9000", opener=open_camera)
     scanning, said = daemon.scanning, daemon.vehicle.said

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 from scipy.ndimage import binary_fill_holes
+from spied import spied
 from typer.testing import CliRunner
 
 from recon.types import F64, Keyframe
@@ -433,8 +434,7 @@ def test_the_orthophoto_of_an_empty_scan_reads_no_images(
 
     rasters = pytest.importorskip("service.offline.exports.rasters", exc_type=ImportError)
     ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
-    read = Mock(return_value=[])
-    monkeypatch.setattr(rasters, "shared_images", read)
+    read = spied(monkeypatch, rasters, "shared_images")
     with pytest.raises(InputError, match="no points"):
         written(tmp_path, "ortho")
     read.assert_not_called()
