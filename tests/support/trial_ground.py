@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from loopback import free_port
-from trial_rig import PATIENCE_S, WHOLE, stored
+from trial_rig import PATIENCE_S, WHOLE, crowd, stored
 
 from service.stream.keys import make_keys, tls_files
 from service.stream.records import ScanHeader
@@ -123,7 +123,7 @@ class Ground:
         start = time.monotonic()
         while not reached():
             alive = self.process.poll() is None
-            late = time.monotonic() > start + PATIENCE_S
+            late = time.monotonic() > start + PATIENCE_S * crowd()
             assert alive and not late, f"{what}:\n{self.said[-3000:]}"
             time.sleep(0.05)
 
@@ -147,7 +147,7 @@ class Ground:
     def stop(self) -> int:
         """The exit code after Ctrl-C and after the deliverables of all scans."""
         self.process.send_signal(signal.SIGINT)
-        return self.process.wait(timeout=3600 if WHOLE else PATIENCE_S)
+        return self.process.wait(timeout=3600 if WHOLE else PATIENCE_S * crowd())
 
     def check(self) -> None:
         """It runs, and no thread or task of it has failed."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from loopback import free_port
 from trial_autopilot import Autopilot
-from trial_rig import BACK_S, WHOLE, Row, Service, scan_folders, stored, with_site
+from trial_rig import WHOLE, Row, Service, back_limit_s, scan_folders, stored, with_site
 
 from service.stream.store import ScanStore
 
@@ -119,7 +119,7 @@ def test_closing_that_hangs_ends_in_a_restart(tmp_path: Path, record: Row) -> No
     assert not lost
     assert json.loads((scan / "scan.json").read_text())["finished"] is True
     assert (scan / "cloud.laz").stat().st_size > 0
-    assert back_s < BACK_S
+    assert back_s < back_limit_s()
 
 
 def _state(service: Service) -> tuple[str, bool]:
@@ -166,4 +166,4 @@ def test_taking_off_while_files_are_written(tmp_path: Path, record: Row) -> None
         assert json.loads((folder / "scan.json").read_text())["finished"] is True
         assert (folder / "cloud.laz").is_file()
     assert "Scan starts when the previous one is closed" in autopilot.texts
-    assert back_s < BACK_S
+    assert back_s < back_limit_s()
