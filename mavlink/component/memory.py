@@ -70,7 +70,10 @@ class Memory:
         fresh = self._path.with_suffix(".new")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            fresh.write_text(text)
+            with fresh.open("w") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())  # a power cut may not leave an empty file
             os.replace(fresh, self._path)
             self._written = text
         except OSError as error:

@@ -44,6 +44,7 @@ log = logging.getLogger(__name__)
 
 S = 1_000_000_000
 SAVE_EVERY_NS, SAVE_SIGNED_NS = 30 * S, S  # with a key, what a crash forgets could be replayed
+SYNC_EVERY_NS = 2 * S  # a power cut costs so much of the log
 TELEMETRY = numbers_of(READERS)
 STUCK_NS = 10 * S
 WAIT_S = 0.5  # of the disk's thread for work
@@ -338,9 +339,12 @@ class VehicleLink:
 
     def _write(self) -> None:
         """The disk's thread. A disk that stalls costs packets of the log, and nothing else."""
-        lost = 0
+        lost, sync_ns = 0, self._clock_ns()
         while not self._stop.is_set():
             self._flush(WAIT_S)
+            if self._clock_ns() >= sync_ns:
+                sync_ns = self._clock_ns() + SYNC_EVERY_NS
+                self.recorder.sync()
             before, lost = lost, self._disk.dropped
             if lost > before:
                 log.warning("the telemetry log lacks %d packets: the disk stalled", lost - before)

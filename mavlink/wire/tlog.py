@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -100,15 +101,28 @@ class TlogRecorder:
                 log.error("the telemetry log was not closed cleanly: %s", error)
 
     def write(self, packet: bytes, monotonic_ns: int) -> None:
-        if self._file is None:
-            return
+        def act(file: BinaryIO) -> None:
+            usec = (monotonic_ns + self._unix_minus_monotonic_ns) // 1000
+            file.write(usec.to_bytes(8, "big") + packet)
+            self.packets += 1
+
+        self._use(act)
+
+    def sync(self) -> None:
+        """Have what is written survive a power cut."""
+
+        def act(file: BinaryIO) -> None:
+            file.flush()
+            os.fsync(file.fileno())
+
+        self._use(act)
+
+    def _use(self, act: Callable[[BinaryIO], None]) -> None:
         with self._lock:
             if self._file is None:
                 return
-            usec = (monotonic_ns + self._unix_minus_monotonic_ns) // 1000
             try:
-                self._file.write(usec.to_bytes(8, "big") + packet)
-                self.packets += 1
+                act(self._file)
             except OSError as error:
                 log.error("the telemetry log ends here: %s", error)
                 self._close()

@@ -28,7 +28,10 @@ def store_image(path: Path, image: U8, tag: KeyframeReport | None = None) -> Non
     exif = Image.Exif()
     exif[GPS] = {} if tag is None else _position(tag)
     part = path.with_suffix(".part")
-    Image.fromarray(image[:, :, ::-1]).save(part, "JPEG", quality=QUALITY, exif=exif)
+    with part.open("wb") as file:
+        Image.fromarray(image[:, :, ::-1]).save(file, "JPEG", quality=QUALITY, exif=exif)
+        file.flush()
+        os.fsync(file.fileno())  # it is reported as taken; a power cut may not leave it empty
     os.replace(part, path)
 
 

@@ -22,9 +22,8 @@ from service.cameras.camera_file import load_camera
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config, load_config
 from service.daemon.runtime import Daemon
-from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import ScanLife
-from service.daemon.scanning import Scanning
+from service.daemon.scanning import Scanning, ScanRun
 from service.flight.scan import Scan, ScanInputs, create_store
 
 MODEL = DEMO / "camera.yaml"

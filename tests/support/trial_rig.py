@@ -16,6 +16,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -238,7 +239,7 @@ def stored(scans: Path) -> set[Chunk]:
     found: set[Chunk] = set()
     for path in scans.rglob("scan.db"):
         try:
-            with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as db:
+            with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
                 rows = db.execute("SELECT seq, layer, crc FROM chunks").fetchall()
         except sqlite3.Error:
             continue  # being made

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
 import pytest
-from loopback import free_port, until
+from loopback import free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 from trial_autopilot import Autopilot
 from trial_ground import Ground
@@ -57,7 +57,10 @@ class Disk:
 
     def unmount(self) -> None:
         """Detach it, once no process uses it any more."""
-        assert until(lambda: subprocess.run(["umount", self.place], check=False).returncode == 0)
+        command = ["umount", str(self.place)]
+        assert until(
+            lambda: not subprocess.run(command, capture_output=True, check=False).returncode
+        )
 
     def cut(self) -> None:
         """From now on nothing reaches the disk."""
@@ -89,11 +92,13 @@ def disk(tmp_path: Path) -> Iterator[Disk]:
 
 def cut(service: Service, disk: Disk) -> set[Chunk]:
     """The power of the aircraft fails; the chunks that its store had acknowledged until then."""
-    processes = [psutil.Process(service.process.pid)]
-    processes += processes[0].children(recursive=True)
-    for process in processes:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            process.suspend()
+    main = psutil.Process(service.process.pid)
+    processes = set[psutil.Process]()
+    while fresh := {main, *main.children(recursive=True)} - processes:
+        for process in fresh:  # which starts no other one from now on
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.suspend()
+        processes |= fresh
     acknowledged = stored(service.scans)
     disk.cut()
     for process in processes:
@@ -171,4 +176,6 @@ def test_a_power_cut_loses_nothing(disk: Disk, tmp_path: Path, record: Row) -> N
     for folder in scan_folders(scans):
         assert json.loads((folder / "scan.json").read_text())["finished"] is True
         assert (folder / "cloud.laz").is_file() or folder.name not in {c[0] for c in kept}
+        assert (folder / "link.tlog").stat().st_size > 0
+    assert "is not used" not in service.log.read_text()  # nor are parameters lost
     assert any("Scan resumed after a restart" in text for text in autopilot.texts)

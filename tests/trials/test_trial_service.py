@@ -38,8 +38,8 @@ from trial_rig import (
 )
 
 from mavlink.component.control import Phase, Result
-from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import Event, ScanLife
+from service.daemon.scanning import ScanRun
 from service.errors import OutsideError
 from service.stream.store import ScanStore
 

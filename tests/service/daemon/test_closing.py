@@ -15,8 +15,8 @@ from paths import ROOT
 
 from mavlink.component.control import Phase
 from service.daemon import runtime
-from service.daemon.scan_run import ScanRun, sizes
 from service.daemon.scan_state import Event
+from service.daemon.scanning import ScanRun, sizes
 from service.memory import one_pool, release_memory
 
 

@@ -21,7 +21,7 @@ from recon.types import PosePrior
 from service.cameras.exif import read_tags
 from service.cameras.source import CameraFrame
 from service.daemon.load_shedding import Level
-from service.daemon.scan_run import PHOTOS, ScanRun
+from service.daemon.scanning import PHOTOS, ScanRun
 from service.daemon.stored_image import image_name, store_image
 from service.flight.scan import Scan
 

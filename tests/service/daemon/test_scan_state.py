@@ -30,9 +30,8 @@ from mavlink.component.presence import Health
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
 from service.daemon.resumption import MARK, Landing, LandingWatch, Left, Resumption
-from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import LAST_RETRY_S, TRANSITIONS, Effect, Event, ScanLife, State
-from service.daemon.scanning import Scanning
+from service.daemon.scanning import Scanning, ScanRun
 from service.errors import OutsideError
 from service.init_system import Notifier
 from service.workers import Worker, Workers, row_of

@@ -21,9 +21,8 @@ from service.cameras.source import CameraFrame, Paced
 from service.daemon.frame_gate import FrameGate
 from service.daemon.resumption import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
-from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import Event, State
-from service.daemon.scanning import Scanning
+from service.daemon.scanning import ScanRun, Scanning
 from service.flight.scan import short_collections
 from service.stream.store import ScanStore
 from service.workers import Worker, Workers

@@ -22,7 +22,7 @@ from service.config import load_config
 from service.daemon import runtime
 from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S
-from service.daemon.scan_run import ScanRun
+from service.daemon.scanning import ScanRun
 from service.daemon.warm_up import SyntheticGround, is_warm, warm_up, warm_up_command
 from service.progress import Progress
 from service.scans.writing import SUMMARY

@@ -10,8 +10,8 @@ from loopback import until
 from onboard import Onboard
 
 from mavlink.component.control import Answer, Phase, Result, Work
-from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import State
+from service.daemon.scanning import ScanRun
 from service.errors import OutsideError
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore

@@ -12,7 +12,7 @@ from rehearsal import RehearsalVehicle
 
 from mavlink.telemetry.clock import DIFFER_NS, WallTime, computer_offset_ns
 from mavlink.wire.dialect import dialect
-from service.daemon.scan_run import disagreement, new_folder, set_since
+from service.daemon.scanning import disagreement, new_folder, set_since
 
 S = 1_000_000_000
 MONTH_NS = 30 * 86_400 * S
