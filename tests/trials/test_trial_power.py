@@ -21,7 +21,7 @@ from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
 import pytest
-from loopback import free_port
+from loopback import free_port, until
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 from trial_autopilot import Autopilot
 from trial_ground import Ground
@@ -58,9 +58,7 @@ class Disk:
     def unmount(self) -> None:
         """Detach it, once no process uses it any more."""
         command = ["umount", str(self.place)]
-        assert until(
-            lambda: not subprocess.run(command, capture_output=True, check=False).returncode
-        )
+        until(lambda: subprocess.run(command, capture_output=True, check=False).returncode == 0)
 
     def cut(self) -> None:
         """From now on nothing reaches the disk."""
