@@ -63,6 +63,10 @@ CALM_S, LONGEST_CALM_S = 30.0, 240.0
 
 @dataclass(frozen=True, slots=True)
 class Strain:
+    """A reading as a multiple of its limit: above 1 it is an overload."""
+
+    times: float
+    calm: float  # below it, as all others are, a step up may be tried
     reason: str
     patience_s: float
     lowest: Level  # lowest level for this cause
@@ -98,14 +102,15 @@ class Ladder:
         if not self.config.relief:
             self.level, self.reason = Level.FULL, ""
             return None
-        found = strain(readings, self.config)
-        if found is not None:
+        found = strains(readings, self.config)
+        worst = next((strain for strain in found if strain.times > 1.0), None)
+        if worst is not None:
             self._calm_since_s = math.nan
             if math.isnan(self._strained_s):
                 self._strained_s = now_s
-            return self._down(found, now_s)
+            return self._down(worst, now_s)
         self._strained_s = math.nan
-        if not is_calm(readings, self.config):
+        if not all(strain.times < strain.calm for strain in found):
             self._calm_since_s = math.nan
             return None
         if math.isnan(self._calm_since_s):
@@ -138,55 +143,30 @@ class Ladder:
         return Move(self.level, "")
 
 
-def strain(readings: MachineReadings, config: ComputeConfig) -> Strain | None:
-    """The overload in ``readings``: memory before heat before lag; None without any."""
+def strains(readings: MachineReadings, config: ComputeConfig) -> list[Strain]:
+    """Those that were measured: memory before heat before lag, of which the worst is first."""
+    found = []
     memory, heat = readings.memory_free_mib, readings.temperature_c
-    if memory is not None and memory < config.least_memory_mib:
+    if memory is not None:
+        times = config.least_memory_mib / max(memory, 1e-6)
         text = f"{memory:.0f} MiB memory free"
-        short = memory < 0.5 * config.least_memory_mib
-        return Strain(text, PATIENCE_S, Level.RECORD_ONLY, jump=short)
-    if heat is not None and heat > config.hottest_c:
-        return Strain(f"{heat:.0f} degrees", HEAT_PATIENCE_S, Level.RECORD_ONLY)
+        found.append(Strain(times, 1 / 1.5, text, PATIENCE_S, Level.RECORD_ONLY, times > 2.0))
+    if heat is not None:
+        times, text = 1.0 + (heat - config.hottest_c) / COOLER_C, f"{heat:.0f} degrees"
+        found.append(Strain(times, 0.0, text, HEAT_PATIENCE_S, Level.RECORD_ONLY))
     if readings.throttled:
-        return Strain("throttled", HEAT_PATIENCE_S, Level.NO_UPSAMPLING)
-    return _lag(readings, config)
-
-
-def _lag(readings: MachineReadings, config: ComputeConfig) -> Strain | None:
-    """The worst lag above its threshold, if any."""
-    views, frames = late_shares(readings)
-    found = (
-        (views / LATE_VIEWS, f"{100 * views:.0f} % of the views late"),
-        (readings.age_s / OLDEST_S, f"images {readings.age_s:.1f} s late"),
-        (frames / LATE_FRAMES, f"{100 * frames:.0f} % of the images missed"),
+        found.append(Strain(math.inf, 0.0, "throttled", HEAT_PATIENCE_S, Level.NO_UPSAMPLING))
+    views = readings.late_views / max(readings.views, 1)
+    frames = readings.late_frames / max(readings.frames, 1)
+    lags = (
+        (views / LATE_VIEWS, 0.5, f"{100 * views:.0f} % of the views late"),
+        (readings.age_s / OLDEST_S, 0.5, f"images {readings.age_s:.1f} s late"),
+        (frames / LATE_FRAMES, 0.75, f"{100 * frames:.0f} % of the images missed"),
     )
-    times, reason = max(found)
-    if times <= 1.0:
-        return None
-    lowest = Level.RECORD_ONLY if times > HOPELESS else Level.NO_UPSAMPLING
-    return Strain(reason, PATIENCE_S, lowest)
-
-
-def late_shares(readings: MachineReadings) -> tuple[float, float]:
-    """Shares of late views and frames, 0 to 1."""
-    return (
-        readings.late_views / max(readings.views, 1),
-        readings.late_frames / max(readings.frames, 1),
-    )
-
-
-def is_calm(readings: MachineReadings, config: ComputeConfig) -> bool:
-    """True when everything is well below its threshold: a step up may be tried."""
-    views, frames = late_shares(readings)
-    heat, memory = readings.temperature_c, readings.memory_free_mib
-    return (
-        not readings.throttled
-        and (heat is None or heat < config.hottest_c - COOLER_C)
-        and (memory is None or memory > 1.5 * config.least_memory_mib)
-        and views < 0.5 * LATE_VIEWS
-        and frames < 0.75 * LATE_FRAMES
-        and readings.age_s < 0.5 * OLDEST_S
-    )
+    for times, calm, text in sorted(lags, reverse=True):
+        lowest = Level.RECORD_ONLY if times > HOPELESS else Level.NO_UPSAMPLING
+        found.append(Strain(times, calm, text, PATIENCE_S, lowest))
+    return found
 
 
 def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:

@@ -220,29 +220,24 @@ class HonestDrone:
 class Watch:
     """The age of an honest drone's poses when they come into the ground's store, seen from outside.
 
-    ``worst_s`` counts from the first pose that came; a pose that never comes is found by
-    :meth:`HonestDrone.lost` of its chunks and by :attr:`last_s`.
+    A pose that never comes is found by :meth:`HonestDrone.lost` of its chunks.
     """
 
     def __init__(self, ground: Ground, name: str) -> None:
-        self.ages_s: list[float] = []
+        self.ages_s: list[tuple[float, float]] = []  # (monotonic time, age) of each that came
         self._place, self._last = ground.store / "drones" / name, 0
-        self._late: list[tuple[float, float]] = []  # (age, time since the start) over a second
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
-    def end(self) -> float:
-        """The worst age, s."""
+    def end(self) -> list[tuple[float, float]]:
+        """When each pose came after the first ones, and its age then, s."""
         self._stop.set()
         self._thread.join()
-        late = [f"{age:.2f} s at {at:.0f} s" for age, at in self._late]
-        print(f"{self._place.name}: {len(self.ages_s)} poses, late ones: {late}", flush=True)
-        return max(self.ages_s, default=float("inf"))
+        return self.ages_s
 
     def _run(self) -> None:
         seen: set[int] = set()
-        began = time.monotonic()
         while not self._stop.wait(0.1):
             for path in self._place.rglob("scan.db"):
                 with contextlib.suppress(sqlite3.Error):
@@ -250,12 +245,9 @@ class Watch:
                     query = "SELECT id, time_unix_ns FROM poses WHERE id > ?"
                     rows = db.execute(query, (self._last - 200,)).fetchall()
                     db.close()
-                    now = time.time_ns()
+                    now, at_s = time.time_ns(), time.monotonic()
                     fresh = [row for row in rows if row[0] not in seen]
                     if seen:
-                        ages_s = [(now - time_ns) * 1e-9 for _, time_ns in fresh]
-                        self.ages_s += ages_s
-                        at = time.monotonic() - began
-                        self._late += [(age, at) for age in ages_s if age > 1.0]
+                        self.ages_s += [(at_s, (now - time_ns) * 1e-9) for _, time_ns in fresh]
                     seen |= {row[0] for row in fresh}
                     self._last = max(seen, default=0)

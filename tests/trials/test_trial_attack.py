@@ -52,7 +52,9 @@ STORES = 300 if WHOLE else 4
 MEDIA = 300 if WHOLE else 40
 SLOW = 1000
 GROWTH_MIB = 50.0
-POSE_S = 2.0
+POSE_S, TIMES, CALM_S = 2.0 if WHOLE else 20.0, 3.0, 60.0 if WHOLE else 3.0
+"""The oldest honest pose beside a hostile peer: so many seconds, or where other programs take the
+cores so many times the oldest one of the same run before and after the attack."""
 EXPORTS = ("laz", "coverage", "dsm", "3dtiles", "kml", "mcap", "colmap", "ply", "contours")
 COMMANDS = (
     *(("export", kind) for kind in (*EXPORTS, "glb", "copc")),
@@ -222,6 +224,8 @@ def test_hostile_datalink_next_to_honest_drones(tmp_path: Path, record: Row) -> 
             threading.Thread(target=hostile_rate, args=(stop, drone, SEED, tally)),
             threading.Thread(target=rogue_station, args=(stop, station, keys, tally)),
         ]
+        time.sleep(CALM_S)
+        began_s = time.monotonic()
         for attacker in attackers:
             attacker.start()
         try:
@@ -230,8 +234,10 @@ def test_hostile_datalink_next_to_honest_drones(tmp_path: Path, record: Row) -> 
             stop.set()
             for attacker in attackers:
                 attacker.join()
+            over_s = time.monotonic() + CALM_S / 2  # with all that it sent
+            time.sleep(CALM_S * 1.5)
             landed = [one.land() for one in drones]
-            worst_s = max(watch.end() for watch in watches)
+            worst_s, calm_s = oldest_s(watches, began_s, over_s)
             drone.close()
             station.close()
         lost = [one.lost(ground) for one in drones]
@@ -240,14 +246,22 @@ def test_hostile_datalink_next_to_honest_drones(tmp_path: Path, record: Row) -> 
         f"attack: {SOAK_MINUTES:g} minutes of hostile datalink beside two honest drones",
         sum(tally.values()),
         f"{tally['records']} records, {tally['reports']} reports, {tally['requests']} requests; "
-        f"worst age of an honest pose {worst_s:.2f} s; the ground's memory "
+        f"worst age of an honest pose {worst_s:.2f} s, without it {calm_s:.2f} s; memory "
         f"{mib[0]:.0f} to {mib[-1]:.0f} MiB; nothing restarted",
         f"{sum(n for n, _ in lost)} of {sum(n for _, n in lost)} honest chunks",
     )
     assert all(landed) and not any(n for n, _ in lost), (lost, ground.said[-3000:])
     assert code == 0 and "Traceback" not in ground.said, (code, ground.said[-3000:])
-    assert worst_s < (POSE_S if WHOLE else 10 * POSE_S)
+    assert worst_s < max(POSE_S, TIMES * calm_s)
     assert max(mib) - mib[0] < GROWTH_MIB, mib
+
+
+def oldest_s(watches: list[Watch], began_s: float, over_s: float) -> tuple[float, float]:
+    """The greatest age of a pose that came during the attack, and before and after it."""
+    ages = [pair for watch in watches for pair in watch.end()]
+    during = [age for at_s, age in ages if began_s < at_s < over_s]
+    beside = [age for at_s, age in ages if not began_s < at_s < over_s]
+    return max(during, default=float("inf")), max(beside, default=0.0)
 
 
 def followed(ground: Ground, stop: threading.Event, tally: Counter[str]) -> list[float]:
@@ -421,7 +435,8 @@ def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
     with Ground(tmp_path) as ground, HonestDrone(tmp_path, "honest", ground.endpoint) as drone:
         ground.until(lambda: stored(ground.store / "drones" / "honest"), "an honest chunk")
         watch = Watch(ground, "honest")
-        answers: list[float] = []
+        time.sleep(CALM_S)
+        began_s, answers = time.monotonic(), list[float]()
         try:
             for k in range(SLOW):
                 address = "127.0.1.1" if k % 2 else f"127.0.{2 + k // 250}.{1 + k % 250}"
@@ -456,7 +471,9 @@ def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
         finally:
             for one, _, _ in opened:
                 one.close()
-            worst_s = watch.end()
+            over_s = time.monotonic() + CALM_S / 2
+            time.sleep(CALM_S * 1.5)
+            worst_s, calm_s = oldest_s([watch], began_s, over_s)
         assert drone.land()
         lost, made = drone.lost(ground)
         assert ground.stop() == 0
@@ -468,7 +485,7 @@ def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
         f"{lost} of {made} honest chunks",
     )
     assert not lost
-    assert worst_s < (POSE_S if WHOLE else 10 * POSE_S)
+    assert worst_s < max(POSE_S, TIMES * calm_s)
 
 
 def honest(ground: Ground, answers: list[float]) -> None:
