@@ -82,7 +82,7 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Report what works, what does not, and the remedy. Exit code 3 when something is bad."""
-    from service.daemon.diagnosis import BAD, examine
+    from service.commands.diagnosis import BAD, examine
 
     chosen = config or (INSTALLED if INSTALLED.is_file() else None)
     findings = []

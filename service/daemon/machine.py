@@ -125,16 +125,12 @@ def _throttled(root: Path) -> bool | None:
 
 def _power_w(root: Path) -> float | None:
     """Power of the input rail: an INA3221 of a Jetson gives volts and amperes per channel."""
-    for sensor in (root / "sys/class/hwmon").glob("hwmon*"):
-        if "ina" not in _text(sensor / "name"):
-            continue
-        for channel in (1, 2, 3):
-            label = _text(sensor / f"in{channel}_label")
-            volts, amperes = (
-                _number(sensor / f"in{channel}_input"),
-                _number(sensor / f"curr{channel}_input"),
-            )
-            if "VDD_IN" in label and volts is not None and amperes is not None:
+    for label in (root / "sys/class/hwmon").glob("hwmon*/in[123]_label"):
+        sensor, channel = label.parent, label.name[2]
+        if "ina" in _text(sensor / "name") and "VDD_IN" in _text(label):
+            volts = _number(sensor / f"in{channel}_input")
+            amperes = _number(sensor / f"curr{channel}_input")
+            if volts is not None and amperes is not None:
                 return volts * amperes / 1e6
     return None
 

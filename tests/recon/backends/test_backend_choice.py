@@ -15,6 +15,7 @@ from paths import ROOT
 
 from recon.backends import Backend, load_backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
+from service.commands.diagnosis import examine_compute
 from service.compute.backend_choice import (
     Choice,
     choose_backend,
@@ -24,7 +25,6 @@ from service.compute.backend_choice import (
     pointless,
 )
 from service.config import ComputeConfig, load_config
-from service.daemon.diagnosis import examine_compute
 from service.errors import InputError, OutsideError
 
 GOOD = 'model = "net.onnx"\nheight = 96\nwidth = 192\n'

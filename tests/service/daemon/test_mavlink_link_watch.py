@@ -18,8 +18,8 @@ from mavlink.component.control import Phase
 from mavlink.component.link_watch import WatchConfig
 from mavlink.component.presence import Health
 from mavlink.wire.dialect import dialect
+from service.commands.diagnosis import BAD, NOTE, Finding, examine_links
 from service.config import load_config
-from service.daemon.diagnosis import BAD, NOTE, Finding, examine_links
 
 GCS = (255, 190)
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from loopback import until
 
+from service.commands.diagnosis import BAD, GOOD, NOTE, check_certificate
 from service.config import DatalinkConfig, load_config
-from service.daemon.diagnosis import BAD, GOOD, NOTE, check_certificate
 from service.errors import InputError, OutsideError
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.keys import (

@@ -15,9 +15,9 @@ from loopback import free_port
 from paths import DEMO
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
+from service.commands import diagnosis
+from service.commands.diagnosis import BAD, GOOD, NOTE, examine, examine_compute, examine_software
 from service.config import load_config
-from service.daemon import diagnosis
-from service.daemon.diagnosis import BAD, GOOD, NOTE, examine, examine_compute, examine_software
 
 
 def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str]]:
@@ -154,7 +154,7 @@ def test_what_is_missing_to_fly_is_reported(tmp_path: Path) -> None:
 
 
 def test_the_boards_settings_are_compared() -> None:
-    from service.daemon.diagnosis import BOARDS, board_of, other_than_profile, profile_path
+    from service.commands.diagnosis import BOARDS, board_of, other_than_profile, profile_path
 
     assert board_of("NVIDIA Jetson Orin Nano Developer Kit") == "orin-nano"
     assert board_of("NVIDIA Jetson AGX Orin Developer Kit") == "orin-agx"
@@ -172,7 +172,7 @@ def test_the_boards_settings_are_compared() -> None:
 
 
 def test_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.diagnosis.is_warm", lambda: True)
+    monkeypatch.setattr("service.commands.diagnosis.is_warm", lambda: True)
     assert findings()["kernels"][0] == GOOD
 
 
