@@ -162,7 +162,7 @@ def test_a_power_cut_loses_nothing(disk: Disk, tmp_path: Path, record: Row) -> N
         assert ground.stop() == 0, ground.said[-3000:]
     autopilot.ended.set()
     record(
-        "power cut: what the disk has not written is gone",
+        "power cut of a disk",
         CUTS + 1,
         "a new scan each time, none after a stop; all scans closed, kept, at the ground",
         f"{len((aboard | sent) - kept)} of {len(aboard | sent)} chunks",
