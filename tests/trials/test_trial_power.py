@@ -164,7 +164,7 @@ def test_a_power_cut_loses_nothing(disk: Disk, tmp_path: Path, record: Row) -> N
     record(
         "power cut of a disk",
         CUTS + 1,
-        "a new scan each time, none after a stop; all scans closed, kept, at the ground",
+        "a new scan each time; none after a stop; all scans closed, kept, at the ground",
         f"{len((aboard | sent) - kept)} of {len(aboard | sent)} chunks",
         max(back_s),
     )

@@ -22,7 +22,7 @@ from service.daemon.frame_gate import FrameGate
 from service.daemon.resumption import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
 from service.daemon.scan_state import Event, State
-from service.daemon.scanning import ScanRun, Scanning
+from service.daemon.scanning import Scanning, ScanRun
 from service.flight.scan import short_collections
 from service.stream.store import ScanStore
 from service.workers import Worker, Workers
