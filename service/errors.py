@@ -48,5 +48,15 @@ class OutsideError(SkyreliefError):
     exit_code = 3
 
 
+@contextmanager
+def outside(what: str, remedy: str = "") -> Iterator[None]:
+    """Make an OSError of the block an OutsideError of ``what`` has failed."""
+    try:
+        yield
+    except OSError as error:
+        text = f"{what} ({error.strerror or error})"
+        raise OutsideError(f"{text}; {remedy}" if remedy else text) from error
+
+
 class NoSenderError(OutsideError):
     """Nothing has come yet at a camera source that waits to be sent images."""

@@ -14,7 +14,7 @@ from pathlib import Path, PureWindowsPath
 
 from mavlink.telemetry.decode import plausible_place
 from service.cameras.source import GeoTag
-from service.errors import InputError
+from service.errors import InputError, refusing
 from service.georeference import degrees_of, system_of
 from service.small_file import read_small
 
@@ -39,10 +39,8 @@ def read_geo(path: Path) -> dict[str, GeoTag]:
     """
     lines = read_small(path, LARGEST_BYTES, "file of positions").decode("utf-8-sig", "replace")
     head, *rows = lines.splitlines() or [""]
-    try:
+    with refusing(f"{path} line 1"):
         system, datum, unit_m = system_of(head)
-    except ValueError as error:
-        raise InputError(f"{path} line 1: {error}") from error
     found: dict[str, GeoTag] = {}
     lines_of: dict[str, int] = {}
     for number, row in enumerate(rows, 2):
@@ -53,10 +51,8 @@ def read_geo(path: Path) -> dict[str, GeoTag]:
         numbers = _numbers(cells)
         if len(numbers) < 2:
             raise InputError(f"{path} line {number}: {row[:80]!r}; give name, x, y and z")
-        try:
+        with refusing(f"{path} line {number}"):
             lon, lat = degrees_of(system, numbers[0], numbers[1])
-        except ValueError as error:
-            raise InputError(f"{path} line {number}: {error}") from error
         height = unit_m * numbers[2] if len(numbers) > 2 else None
         if not plausible_place(lat, lon) or abs(height or 0.0) > MAX_HEIGHT_M:
             raise InputError(f"{path} line {number}: {row[:80]!r} is not on the globe")

@@ -16,7 +16,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from service.errors import OutsideError
+from service.errors import outside
 from service.listener import BoundedListener, ListenerLimits, host_name, is_loopback, parse_address
 from service.redaction import redacted
 from service.workers import PROCESS
@@ -39,12 +39,8 @@ class HealthServer:
     def __init__(self, address: str, snapshot: Snapshot) -> None:
         """Listen on HOST:PORT; raises OutsideError when it is in use."""
         host, port = parse_address(address, "health.http")
-        try:
+        with outside(f"health.http {address} cannot be served", "give another port"):
             listener = BoundedListener(host, port, LIMITS)
-        except OSError as error:
-            raise OutsideError(
-                f"health.http {address} cannot be served: {error.strerror}; give another port"
-            ) from error
         self.port = int(listener.getsockname()[1])
         self._server = _Server(listener, snapshot, is_loopback(host))
         self._worker = PROCESS.start("health", lambda _: self._server.serve_forever())

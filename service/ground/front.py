@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from service.errors import OutsideError
+from service.errors import OutsideError, outside
 from service.listener import (
     BoundedListener,
     ListenerLimits,
@@ -65,14 +65,10 @@ class Front:
         self._handshakes = Counter[str]()  # by network
 
     def _listen(self) -> BoundedListener:
-        try:
+        remedy = "another program may have this port, such as a second ground station"
+        with outside(f"datalink does not open at {self.endpoint}", remedy):
             # A connection takes two descriptors.
             return BoundedListener(self._host, self._port, fitting(LIMITS, 8))
-        except OSError as error:
-            raise OutsideError(
-                f"datalink does not open at {self.endpoint}: {error.strerror}; another program may "
-                "have this port, such as a second ground station"
-            ) from error
 
     def close(self) -> None:
         """Release the address where :meth:`run` was not called."""

@@ -25,7 +25,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
-from service.errors import InputError, MissingError, OutsideError
+from service.errors import InputError, MissingError, OutsideError, refusing
 from service.ground.bodies import BODIES, Body, JSONResponse, changing
 from service.ground.control import control_routes
 from service.ground.guard import (
@@ -320,10 +320,8 @@ def _products(request: Request) -> Response:
 def _export(request: Request, order: ExportOrder) -> Response:
     """Make a deliverable in the background, or refine the scan; the job."""
     note(request, "export", **msgspec.structs.asdict(order))
-    try:
+    with refusing("the request is not valid"):
         options = ExportOptions(vertical_datum=order.vertical_datum, to_datum=order.to_datum)
-    except ValueError as error:
-        raise InputError(f"the request is not valid: {error}"[:300]) from error
     job = state_of(request).jobs.start(folder_of(request), order.kind, options=options)
     return JSONResponse(job, 202)
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import msgspec
 
-from service.errors import InputError, MissingError, OutsideError, SkyreliefError
+from service.errors import InputError, MissingError, SkyreliefError, outside
 from service.ground.mcap_import import header_in, store_from_mcap
 from service.ground.scan_facts import Labels, facts_of, is_current, read_strictly
 from service.ground.storage import (
@@ -331,8 +331,6 @@ def _safe(name: str, what: str) -> str:
 
 
 def _move(source: Path, target: Path) -> None:
-    try:
+    with outside(f"cannot move {source.name}"):
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(source, target)
-    except OSError as error:
-        raise OutsideError(f"cannot move {source.name} ({error.strerror})") from error

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError, outside
 from service.ground import drone
 from service.ground.basemap import open_basemap
 from service.ground.guard import (
@@ -138,14 +138,9 @@ class Portal:
         import uvicorn
 
         config = self.config
-        try:
+        with outside(f"portal: cannot listen on {config.host}:{port}", "choose another address"):
             # A quarter of the descriptors, so that the datalink has some.
             listener = BoundedListener(config.host, port, fitting(ListenerLimits(), 4))
-        except OSError as error:
-            raise OutsideError(
-                f"portal: cannot listen on {config.host}:{port} ({error.strerror}); "
-                "choose another address"
-            ) from error
         self._listener, self._port = listener, int(listener.getsockname()[1])
         logging.getLogger("uvicorn.error").addFilter(_few_warnings)
         self._server = uvicorn.Server(

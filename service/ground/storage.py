@@ -17,11 +17,11 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, cast
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError, OutsideError, outside
 from service.offline.site import DRONE
 from service.scans.folder import write_deliverables
 from service.scans.retention import Claim, existing
@@ -82,10 +82,8 @@ class DiskShare:
         """Measure the disk, and now and then the folder: others write there too."""
         if now - self._looked_at >= self._look_s:
             self._looked_at = now
-            try:
+            with outside(f"cannot read the disk of {self._folder}"):
                 self._total_bytes, _, self._free_bytes = self._usage(existing(self._folder))
-            except OSError as error:
-                raise OutsideError(f"cannot read the disk of {self._folder} ({error})") from error
         if now - self._measured_at >= MEASURE_S:
             self._measured_at = now
             self._used_bytes = folder_bytes(self._folder)
@@ -193,20 +191,17 @@ def copy_files(source: Path, target: Path, names: Iterable[str]) -> set[str]:
     except (OSError, ValueError) as error:
         raise InputError(f"{_short(source)} is not a folder that can be read") from error
     files: dict[str, int] = {}
-    try:
+    with ExitStack() as opened, outside(f"cannot copy {_short(source)} to {target}"):
+        opened.callback(os.close, folder)
         for name in names:
             handle = _open_regular(folder, name)
             if handle is not None:
+                opened.callback(os.close, handle)
                 files[name] = handle
         sizes = {name: os.fstat(handle).st_size for name, handle in files.items()}
         check_room(sum(sizes.values()), target)
         for name, handle in files.items():
             _copy(handle, target / name, sizes[name])
-    except OSError as error:
-        raise OutsideError(f"cannot copy {_short(source)} to {target} ({error})") from error
-    finally:
-        for handle in (folder, *files.values()):
-            os.close(handle)
     return set(files)
 
 
@@ -325,7 +320,7 @@ def _take(store: Path, folder: Path, deliver: Callable[..., object]) -> Path:
 def workplace(store: Path) -> Iterator[Path]:
     """A folder in the store to copy to, gone afterwards. Raises OutsideError when the disk is
     full, there and for what is done in it."""
-    try:
+    with outside(f"cannot write in {store}"):
         store.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=TAKING, dir=store) as place:
             claim = Claim()
@@ -334,8 +329,6 @@ def workplace(store: Path) -> Iterator[Path]:
                 yield Path(place)
             finally:
                 claim.give_up()
-    except OSError as error:
-        raise OutsideError(f"cannot write in {store} ({error.strerror or error})") from error
 
 
 def clear_leftovers(store: Path) -> int:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError, outside
 from service.ground.guard import MAX_UPLOAD_BYTES
 from service.ground.library import FILES, Library
 from service.ground.storage import (
@@ -102,17 +102,15 @@ class Upload:
         """Whether it is a video with its log, which :meth:`replay` makes a scan of."""
         return len(self._paths) > 1
 
+    @outside("the upload cannot be stored")
     def write(self, data: bytes) -> None:
         """Append to the files. Raises InputError past their size, OutsideError for the disk."""
-        try:
-            while data:
-                if not self._left:
-                    self._next()
-                assert self._file is not None
-                self._file.write(data[: self._left])
-                data, self._left = data[self._left :], max(self._left - len(data), 0)
-        except OSError as error:
-            raise OutsideError(f"the upload cannot be stored ({error.strerror})") from error
+        while data:
+            if not self._left:
+                self._next()
+            assert self._file is not None
+            self._file.write(data[: self._left])
+            data, self._left = data[self._left :], max(self._left - len(data), 0)
 
     def _next(self) -> None:
         if not self._waiting:
@@ -133,6 +131,7 @@ class Upload:
         if self._file is not None:
             self._file.close()
 
+    @outside("the upload cannot be stored")
     def finish(self) -> tuple[str, str]:
         """Import the scan; its drone and name. InputError when it is none."""
         (path,) = self._paths
@@ -147,8 +146,6 @@ class Upload:
             else:
                 path.rename(folder / STORE_FILES[0])
             return self._library.take(folder)
-        except OSError as error:
-            raise OutsideError(f"the upload cannot be stored ({error.strerror})") from error
         except InputError as error:
             raise InputError(OWN_PATH.sub("", str(error))) from error
 

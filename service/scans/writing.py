@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError, OutsideError, outside
 
 SUMMARY = "scan.json"
 
@@ -93,13 +93,10 @@ def _beside(path: Path) -> Iterator[Path]:
     """The temporary path, after those of processes that are gone were removed."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(path)
-        yield part
-    except OSError as error:
-        raise OutsideError(
-            f"cannot write {path} ({error.strerror or error}); check the disk and its rights"
-        ) from error
+        with outside(f"cannot write {path}", "check the disk and its rights"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _remove_abandoned(path)
+            yield part
     finally:
         with suppress(OSError):  # a disk that cannot be written cannot be cleaned either
             _remove(part)

@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from service.errors import InputError, OutsideError, SkyreliefError
+from service.errors import InputError, OutsideError, SkyreliefError, outside
 
 log = logging.getLogger(__name__)
 
@@ -200,7 +200,7 @@ class Database:
         self.lock = threading.RLock()
         self.read_only = read_only or not can_write(path)
         try:
-            with ExitStack() as on_fault:
+            with outside(f"{path} cannot be opened"), ExitStack() as on_fault:
                 self._connection, self._start = connect(path, self.read_only, statement_s)
                 on_fault.callback(self._connection.close)
                 check_schema(self._connection, path)
@@ -209,8 +209,6 @@ class Database:
                     self._connection.execute("PRAGMA synchronous=FULL")
                     self._connection.executescript(SCHEMA)
                 on_fault.pop_all()
-        except OSError as error:
-            raise OutsideError(f"{path} cannot be opened ({error.strerror or error})") from error
         except sqlite3.Error as error:
             raise as_error(path, error) from error
 

@@ -10,7 +10,7 @@ import numpy as np
 from recon import se3
 from recon.surface.splats import Splats, joined, splats_of, steps
 from recon.types import F32, F64, Bool
-from service.errors import InputError
+from service.errors import InputError, refusing
 from service.offline.exports.clouds import VOXELS_MARGIN_M, ply_head
 from service.offline.exports.images import resized, shared_images
 from service.offline.exports.model import LARGEST_FACES, closed_surface
@@ -72,10 +72,8 @@ def _made(scan: ScanView, options: ExportOptions, box: Box) -> Splats | None:
     keyframes = list(main_keyframes(scan.store))
     progress = scan.progress
     fused = scan.fused
-    try:
+    with refusing(str(scan.folder)):
         surface = closed_surface(scan, LARGEST_FACES)
-    except ValueError as error:
-        raise InputError(f"{scan.folder}: {error}") from error
     with progress.part("reading images", 0.2):
         views = shared_images(scan, options)
     pixels = sum(int(np.prod(v.bgra.shape[:2])) * float(k.fresh.mean())
