@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-import cv2
-
 from recon.types import U8
 
 
@@ -49,6 +47,8 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
 
 def embedded(image: U8, kind: str = "jpeg", quality: int = 90) -> str:
     """The address of an image (BGR, as PNG also BGRA) that holds its data."""
+    import cv2  # the demo, whose verdict is from here, starts without
+
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
     code = base64.b64encode(cv2.imencode(f".{kind}", image, options)[1].tobytes())
     return f"data:image/{kind};base64,{code.decode()}"
