@@ -54,6 +54,7 @@ class Tags:
     lens: Lens | None = None
     turned_deg: int = 0  # clockwise rotation that viewers apply to the stored pixels
     camera: str = ""  # of several of a drone, as its maker names it
+    model: str = ""  # of the camera
     differences: tuple[tuple[str, float], ...] = ()  # two sources of one value, metres apart
     is_hemisphere_missing: bool = False  # there is a position without N, S, E, W
 
@@ -143,6 +144,7 @@ def _read_tags(path: Path, hemisphere: str) -> Tags:
         lens=lens_of(photo, xmp, size_px),
         turned_deg=TURNED_DEG.get(exif.get(274, 1), 0),
         camera=xmp.get("ImageSource", "").strip()[:40],
+        model=str(exif.get(272, "")).strip("\0 ")[:40],
         differences=(*apart, *differs),
         is_hemisphere_missing=is_hemisphere_missing,
     )

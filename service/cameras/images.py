@@ -49,6 +49,10 @@ ONE_FLIGHT_S, MAX_COMPARED = 600.0, 400
 """Images of one flight are so close in time; so many at most are compared with each."""
 
 ROLLED_DEG = 45.0
+QUARTER_DEG = 270
+"""Clockwise, undoes what a program did to an image of a camera held upright, where no tag states
+it; the other way is as likely, and the same to a lens that is alike all around."""
+
 ZONE_NS = 900 * SECOND_NS  # time zones are multiples of a quarter of an hour
 
 
@@ -81,12 +85,14 @@ class ImagesSource(CameraSource):
         tagged = self._headings(self._same_lens(self._same_size(tagged)))
         times, self.epoch_unix_ns = self._times(tagged, interval_s)
         tagged = self._places(tagged, times)
+        stored = Counter(tags.size_px for _, tags in tagged).most_common(1)[0][0]
+        self._stored_px = stored
+        self.turned_deg = self._turn(tagged)
+        tagged = [(path, self._as_used(tags)) for path, tags in tagged]
         order = sorted(range(len(tagged)), key=lambda i: (times[i], i))
         self._stills = [(*tagged[i], times[i]) for i in order]
-        stored = tagged[0][1].size_px
-        self.turned_deg = self._turn(tagged)
         self.size_px = stored[::-1] if self.turned_deg % 180 else stored
-        self.lens = tagged[0][1].lens
+        self.lens = next(tags.lens for _, tags in tagged if tags.size_px == stored)
         self.camera = (
             None if self.lens is None else turned(self.lens.camera(stored), self.turned_deg)
         )
@@ -97,7 +103,7 @@ class ImagesSource(CameraSource):
         """Yield the stills that decode."""
         seq = 0
         for path, tags, time_ns in self._stills:
-            image = _load(path, tags.size_px, self.turned_deg)
+            image = _load(path, tags.size_px, self._turned_deg(tags))
             if image is None or image.shape[:2] != (self.size_px[1], self.size_px[0]):
                 self._warn(f"{path.name} cannot be decoded; skipped")
                 continue
@@ -150,13 +156,14 @@ class ImagesSource(CameraSource):
         return tagged
 
     def _one_camera(self, tagged: list[Still], chosen: str) -> list[Still]:
-        """Stills of the camera ``chosen`` by its name or size, else of the one that sees most."""
+        """Stills of the camera ``chosen`` by its name, size or model, else of the one that sees
+        most."""
         cameras = by_camera(tagged, lambda tags: tags.camera)
         if chosen:
-            for one in (cameras, by_camera(tagged, size_of)):
-                if chosen in one:
-                    return one[chosen]
-            known = ", ".join([*filter(None, cameras), *by_camera(tagged, size_of)])
+            named = by_camera(tagged, lambda t: t.model) | by_camera(tagged, size_of) | cameras
+            if chosen in named:
+                return named[chosen]
+            known = ", ".join(filter(None, [*cameras, *named]))
             raise InputError(f"{self.description}: no images of camera {chosen!r}, but of {known}")
         if len(cameras) - ("" in cameras) < 2:
             return tagged
@@ -223,20 +230,42 @@ class ImagesSource(CameraSource):
         ]
 
     def _same_size(self, tagged: list[Still]) -> list[Still]:
-        """Stills of the size taken at most moments: a camera model is for one size.
+        """Stills of the size taken at most moments, as stored or turned by a quarter: a camera
+        model is for one size.
 
         Of sizes taken about as often it is that of the camera that sees most: a drone takes
         thermal or spectral images with those in colour.
         """
-        sizes = by_camera(tagged, size_of)
-        size = widest(sizes)
-        others = sorted(sizes.keys() - {size}, key=lambda other: -len(sizes[other]))
-        if others:
+        sizes = by_camera(tagged, lambda tags: "{}x{}".format(*sorted(tags.size_px)))
+        used = sizes.pop(widest(sizes))
+        size, *turned = (name for name, _ in Counter(size_of(t) for _, t in used).most_common())
+        if turned:
+            odd = sum(size_of(tags) != size for _, tags in used)
+            self._warn(f"{odd} images are {turned[0]}: turned to {size} like the others")
+        if sizes:
+            other = size_of(max(sizes.values(), key=len)[0][1])
             self._warn(
-                f"{len(tagged) - len(sizes[size])} images are not {size} like the others; skipped "
-                f"(images:DIR?camera={others[0]} takes those)"
+                f"{len(tagged) - len(used)} images are not {size} like the others; skipped "
+                f"(images:DIR?camera={other} takes those)"
             )
-        return sizes[size]
+        return used
+
+    def _turned_deg(self, tags: Tags) -> int:
+        """Rotation of a still from how it is stored to how it is used, clockwise."""
+        back = tags.turned_deg if tags.turned_deg % 180 else QUARTER_DEG
+        return (self.turned_deg + back * (tags.size_px != self._stored_px)) % 360
+
+    def _as_used(self, tags: Tags) -> Tags:
+        """The tags of a still whose gimbal's angles are those of the image as it is used: of one
+        that is used on its side they are of its upper side."""
+        tag = tags.geotag
+        if tag is None or tag.ypr_deg is None or tags.size_px == self._stored_px:
+            return tags
+        yaw, pitch, roll = tag.ypr_deg
+        if abs(roll) > ROLLED_DEG:  # the gimbal's own turn
+            return tags
+        ypr_deg = yaw, pitch, roll - (self._turned_deg(tags) - tags.turned_deg)
+        return replace(tags, geotag=replace(tag, ypr_deg=ypr_deg))
 
     def _same_lens(self, tagged: list[Still]) -> list[Still]:
         """Stills of the most frequent focal length, the shortest of those as frequent: a camera
@@ -250,9 +279,12 @@ class ImagesSource(CameraSource):
         usual = min(f for f, times in alike.items() if times >= AS_OFTEN * most)
         kept = [t for t, f in zip(tagged, focal, strict=True) if f and abs(f / usual - 1) < ZOOM]
         if len(kept) < len(tagged):
+            models = {tags.model for _, tags in kept}
+            others = {tags.model for _, tags in tagged} - models - {""}
+            takes = f" (images:DIR?camera={min(others)} takes those)" if others else ""
             self._warn(
                 f"{len(tagged) - len(kept)} images were not taken with the focal length of the "
-                "others; skipped"
+                f"others; skipped{takes}"
             )
         return kept
 
@@ -308,7 +340,7 @@ class ImagesSource(CameraSource):
         A camera that looks down has no defined upper side: where the tags differ, or the gimbal
         itself was rolled, the images stay as stored.
         """
-        turns = {tags.turned_deg for _, tags in tagged}
+        turns = {tags.turned_deg for _, tags in tagged if tags.size_px == self._stored_px}
         rolls = [
             abs(tags.geotag.ypr_deg[2])
             for _, tags in tagged

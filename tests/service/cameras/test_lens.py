@@ -23,9 +23,11 @@ from recon.types import F64, U8, Camera
 from service.cameras import open_camera
 from service.cameras.exif import read_tags
 from service.cameras.lens import SIGMA_FOCAL, Lens, by_view, fitted, reshaped, turned
+from service.cameras.rig import Rig
 from service.cameras.source import CameraSource
 from service.cli import app
 from service.commands.missing_metadata import start_lens
+from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError
 
 DEWARP = "2020-05-27;3666.66,3665.99,-27.8,30.0,-0.269,0.112,0.0003,-0.0001,-0.033"
@@ -258,12 +260,63 @@ def test_tags_that_disagree_leave_images_as_stored(tmp_path: Path) -> None:
     assert any("different orientations" in warning for warning in source.warnings)
 
 
+@pytest.mark.parametrize(("quarters", "orientation"), [(1, 6), (3, 8), (1, 1)])
+def test_an_image_that_was_stored_on_its_side_is_turned_back(
+    tmp_path: Path, quarters: int, orientation: int
+) -> None:
+    """By its tag; where a program removed that, one way, and its attitude with it."""
+    angles = {"GimbalYawDegree": "30", "GimbalPitchDegree": "-60", "GimbalRollDegree": "0"}
+    packet = xmp_of(angles).encode()
+    for i in range(4):
+        stored, exif = marked((64, 48)), Image.Exif()
+        if i == 2:
+            stored = np.ascontiguousarray(np.rot90(stored, quarters))
+            exif[274] = orientation
+        Image.fromarray(stored).save(tmp_path / f"{i}.jpg", exif=exif, xmp=packet, quality=95)
+    source = open_camera(str(tmp_path))
+    frames = list(source)
+    assert source.size_px == (64, 48) and len(frames) == 4
+    assert any("1 images are 48x64: turned to 64x48" in warning for warning in source.warnings)
+    rolls = [frame.geotag.ypr_deg[2] % 360 for frame in frames if frame.geotag]
+    if orientation != 1:
+        assert all(upper_left(frame.image) for frame in frames)
+        assert rolls == [0.0] * 4
+        return
+    # What its upper left corner shows lies in the direction that attitude and image agree on.
+    assert rolls == [0.0, 0.0, 90.0, 0.0]
+    rig = Rig(CameraConfig(), ScanConfig(), FusionConfig())
+    K = Lens(0.75).camera((48, 64)).K
+    upright = rig.prior(None, frames[0].geotag).R_world_camera
+    used = rig.prior(None, frames[2].geotag).R_world_camera
+    stored_px = np.array([[5.0, 6.0]])
+    at = np.zeros((64, 48), np.uint8)
+    at[6, 5] = 1
+    row, col = np.argwhere(np.rot90(at, -3))[0]
+    K_used = Lens(0.75).camera((64, 48)).K
+    ray = rays(K_used, np.array([[float(col), float(row)]]))
+    assert upright is not None and used is not None
+    assert np.allclose(rays(K, stored_px) @ upright.T, ray @ used.T)
+
+
 def test_another_zoom_is_left_out(tmp_path: Path) -> None:
     for i, focal in enumerate((24, 24, 70, 24)):
         write_still(tmp_path / f"{i}.jpg", (64, 48), {41989: focal})
     source = open_camera(str(tmp_path))
     assert [frame.name for frame in source] == ["0.jpg", "1.jpg", "3.jpg"]
     assert any("focal length" in warning for warning in source.warnings)
+
+
+def test_another_drones_images_of_the_same_size_are_a_scan_of_their_own(tmp_path: Path) -> None:
+    for i, (focal, model) in enumerate(((24, "FC6310"), (28, "L1D 20c"), (24, "FC6310"))):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[41989], exif[272] = focal, model
+        Image.fromarray(marked((64, 48))).save(tmp_path / f"{i}.jpg", exif=exif)
+    source = open_camera(str(tmp_path))
+    assert [frame.name for frame in source] == ["0.jpg", "2.jpg"]
+    asked = "images:DIR?camera=L1D 20c"
+    assert any(asked in warning for warning in source.warnings)
+    other = open_camera(asked.replace("DIR", str(tmp_path)))
+    assert [frame.name for frame in other] == ["1.jpg"]
 
 
 @pytest.mark.parametrize(
