@@ -1,6 +1,6 @@
 """The dialect: all messages of ``common`` and ArduPilot's own, from pymavlink.
 
-pymavlink has no type annotations; only this module imports it untyped.
+pymavlink has no type annotations; this module imports it untyped.
 """
 
 from __future__ import annotations

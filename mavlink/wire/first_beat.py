@@ -13,6 +13,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from pymavlink.generator.mavcrc import x25crc  # type: ignore[import-untyped]
+
 from mavlink.wire.link import Link, parse_link
 from mavlink.wire.stand_in import AFTER_S, Beat, StandIn, Way
 
@@ -47,17 +49,8 @@ def heartbeat_packet(sequence: int, system: int, component: int, token: int) -> 
     payload = struct.pack("<IBBBBB", token, TYPES[component], NO_AUTOPILOT, 0, BOOT, VERSION)
     head = struct.pack("<BBBBBB", len(payload), 0, 0, sequence & 0xFF, system, component)
     body = head + HEARTBEAT.to_bytes(3, "little") + payload
-    return b"\xfd" + body + _crc(body + bytes((CRC_EXTRA,))).to_bytes(2, "little")
-
-
-def _crc(data: bytes) -> int:
-    """CRC-16/MCRF4XX."""
-    crc = 0xFFFF
-    for byte in data:
-        step = (byte ^ crc) & 0xFF
-        step = (step ^ step << 4) & 0xFF
-        crc = crc >> 8 ^ step << 8 ^ step << 3 ^ step >> 4
-    return crc
+    crc: int = x25crc(body + bytes((CRC_EXTRA,))).crc
+    return b"\xfd" + body + crc.to_bytes(2, "little")
 
 
 class FirstBeats:

@@ -140,6 +140,13 @@ class Relayed(CameraSource):
         self.start_monotonic_ns = source.start_monotonic_ns
         self.warnings = source.warnings
 
+    @property
+    def dropped(self) -> int:
+        return self._source.dropped
+
+    def close(self) -> None:
+        self._source.close()
+
 
 def ahead(source: CameraSource, kept: int = 4) -> Generator[CameraFrame, None, None]:
     """Every image of ``source`` in order, with at most ``kept`` of them decoded in advance.

@@ -61,7 +61,9 @@ class FrameGate(Relayed):
     def _passing(self) -> Iterator[CameraFrame]:
         for frame in self._source:
             self.frames += 1
-            self._measure(frame)
+            if self.start_monotonic_ns is not None:
+                shown_ns = self.start_monotonic_ns + frame.time_ns
+                self.age_s = max(0.0, 1e-9 * (time.monotonic_ns() - shown_ns))
             level = self.level
             if level is Level.RECORD_ONLY:
                 self._keep(frame)
@@ -77,19 +79,6 @@ class FrameGate(Relayed):
         """Seconds spent on the current frame; 0 while waiting for the camera."""
         taken_s = self._taken_s
         return 0.0 if taken_s is None else time.monotonic() - taken_s
-
-    @property
-    def late(self) -> int:
-        """Camera frames that were dropped because nothing took them in time."""
-        return self._source.dropped
-
-    def close(self) -> None:
-        self._source.close()
-
-    def _measure(self, frame: CameraFrame) -> None:
-        if self.start_monotonic_ns is not None:
-            shown_ns = self.start_monotonic_ns + frame.time_ns
-            self.age_s = max(0.0, 1e-9 * (time.monotonic_ns() - shown_ns))
 
     def _keep(self, frame: CameraFrame) -> None:
         """Store the image if one is due and the disk has room."""

@@ -29,25 +29,34 @@ PREFIX = "skyrelief_"
 DESCRIPTION = Path(__file__).with_name("openapi.json")
 
 
-class HealthServer:
+class HealthServer(ThreadingHTTPServer):
     """``/healthz`` (200 or 503), ``/status`` (JSON) and ``/metrics`` (Prometheus) over HTTP.
 
     ``/openapi.json`` describes them. ``snapshot`` is called for each request, on its thread; its
     ``ok`` determines ``/healthz``, its numbers become metrics.
     """
 
+    daemon_threads = True
+
     def __init__(self, address: str, snapshot: Snapshot) -> None:
         """Listen on HOST:PORT; raises OutsideError when it is in use."""
         host, port = parse_address(address, "health.http")
         with outside(f"health.http {address} cannot be served", "give another port"):
             listener = BoundedListener(host, port, LIMITS)
+        super().__init__(listener.getsockname()[:2], _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = self._listener = listener
         self.port = int(listener.getsockname()[1])
-        self._server = _Server(listener, snapshot, is_loopback(host))
-        self._worker = PROCESS.start("health", lambda _: self._server.serve_forever())
+        self.snapshot, self.is_local = snapshot, is_loopback(host)
+        self._worker = PROCESS.start("health", lambda _: self.serve_forever())
+
+    def service_actions(self) -> None:
+        """Called twice a second while serving."""
+        self._listener.sweep()
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self.shutdown()
+        self.server_close()
         self._worker.join()
 
 
@@ -66,20 +75,6 @@ def _is_own(header: str | None, is_local: bool) -> bool:
     return name.partition(".")[0] == socket.gethostname().partition(".")[0].lower()
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-
-    def __init__(self, listener: BoundedListener, snapshot: Snapshot, is_local: bool) -> None:
-        super().__init__(listener.getsockname()[:2], _Handler, bind_and_activate=False)
-        self.socket.close()
-        self.socket = self._listener = listener
-        self.snapshot, self.is_local = snapshot, is_local
-
-    def service_actions(self) -> None:
-        """Called twice a second while serving."""
-        self._listener.sweep()
-
-
 def metrics_text(snapshot: dict[str, Any], prefix: str = PREFIX) -> str:
     """Prometheus text of the numbers in ``snapshot``; nested names are joined by ``_``."""
     lines = []
@@ -93,7 +88,7 @@ def metrics_text(snapshot: dict[str, Any], prefix: str = PREFIX) -> str:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: _Server
+    server: HealthServer
     server_version = "skyrelief"
     sys_version = ""
     timeout = 10.0

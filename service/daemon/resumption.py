@@ -107,13 +107,10 @@ class LandingWatch:
         if is_armed or not wants_scan or close_after_s <= 0.0:
             self._has_flown = wants_scan and (is_armed or self._has_flown)
             self._landed_s = None
-            return Landing.NOTHING
-        if self._landed_s is None:
-            if not (self._has_flown and is_disarmed):
-                return Landing.NOTHING
+        elif self._landed_s is None and self._has_flown and is_disarmed:
             self._landed_s = now_s
             return Landing.LANDED
-        if now_s - self._landed_s < close_after_s:
-            return Landing.NOTHING
-        self._has_flown, self._landed_s = False, None
-        return Landing.CLOSE
+        elif self._landed_s is not None and now_s - self._landed_s >= close_after_s:
+            self._has_flown, self._landed_s = False, None
+            return Landing.CLOSE
+        return Landing.NOTHING

@@ -129,7 +129,7 @@ class ScanRun:
         scan, gate = self.scan, self.gate
         if scan is None or gate is None:
             return MachineReadings()
-        dropped, late = scan.worker.dropped, gate.late
+        dropped, late = scan.worker.dropped, gate.dropped
         counted = scan.recorder.keyframes + dropped, dropped, gate.frames + late, late
         views, late_views, frames, late_frames = map(sub, counted, self._counted)
         self._counted = counted
@@ -145,7 +145,7 @@ class ScanRun:
             return {}
         return {
             "frame_age_s": round(gate.age_s, 3),
-            "frames_late": gate.late,
+            "frames_late": gate.dropped,
             "views_late": scan.worker.dropped,
             "pictures_kept": gate.kept,
             "pictures_lost": gate.lost,

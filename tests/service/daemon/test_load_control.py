@@ -68,7 +68,7 @@ def test_lower_rate_passes_every_second_frame(level: Level, tmp_path: Path) -> N
     gate, alive = gate_over(Film(), tmp_path, level)
     assert [f.seq for f in gate] == list(range(1, 100, 2))
     assert len(alive) == 50
-    assert gate.late == 7
+    assert gate.dropped == 7
     full, _ = gate_over(Film(), tmp_path, Level.FULL)
     assert [f.seq for f in full] == list(range(100))
     assert not (tmp_path / "later").exists()
