@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import sub
@@ -627,14 +627,10 @@ def sizes(folder: Path) -> tuple[tuple[str, int], ...]:
 
     The store and the link's log are left out, because others write them too.
     """
-    found = []
-    try:
-        for path in folder.iterdir():
-            if not path.name.startswith(OTHERS):
-                found.append((path.name, path.stat().st_size))
-    except OSError:
-        pass  # it is not there yet, or a file was renamed meanwhile
-    return tuple(sorted(found))
+    with suppress(OSError):  # it is not there yet, or a file was renamed meanwhile
+        files = (path for path in folder.iterdir() if not path.name.startswith(OTHERS))
+        return tuple(sorted((path.name, path.stat().st_size) for path in files))
+    return ()
 
 
 def new_folder(scans: Path, unix_s: float) -> Path:

@@ -6,7 +6,6 @@ of compiling them for minutes on a small board; a scan that stalls for seconds c
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 import time
@@ -20,12 +19,10 @@ import numpy as np
 
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config, change
-from service.errors import OutsideError
 from service.progress import Progress
 from service.scans.writing import write_whole
 from service.version import software
-
-log = logging.getLogger(__name__)
+from service.workers import guarded
 
 SIZE_PX = (320, 240)
 FOCAL_PX = 300.0
@@ -98,7 +95,9 @@ def warm_up(config: Config, progress: Progress) -> tuple[float, int]:
         summary = scan.close()
         write_deliverables(Path(folder), store, {})
         store.close()
-    _mark()
+    marker = _marker(os.environ.get("NUMBA_CACHE_DIR", ""))
+    if marker is not None:
+        guarded(f"marker {marker}", lambda: write_whole(marker, software()))
     return time.monotonic() - start, int(summary["keyframes"])
 
 
@@ -134,16 +133,6 @@ def is_warm(version: str = "") -> bool:
         return marker is not None and marker.read_text(encoding="utf-8") == (version or software())
     except OSError:
         return False
-
-
-def _mark() -> None:
-    marker = _marker(os.environ.get("NUMBA_CACHE_DIR", ""))
-    if marker is None:
-        return
-    try:
-        write_whole(marker, software())
-    except OutsideError as error:
-        log.warning("%s", error)
 
 
 def _services_cache(prefix: str = sys.prefix) -> str:
