@@ -98,9 +98,12 @@ def score_views(
 
 def frame_scores(
     scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {},
-    every: int = EVERY,
+    every: int = EVERY, goes_on: Callable[[int], bool] = lambda _: True,
 ) -> dict[str, list[tuple[float, float, float]]]:  # fmt: skip
-    """Share covered, PSNR in dB and SSIM of each frame, by product; as ``score_views`` else."""
+    """Share covered, PSNR in dB and SSIM of each frame, by product; as ``score_views`` else.
+
+    ``goes_on`` is asked with the number of frames that are done.
+    """
     with needing("score --views"):
         import open3d  # noqa: F401
         from skimage.metrics import structural_similarity
@@ -112,6 +115,8 @@ def frame_scores(
         counts = inside(camera, T) & (undistort.valid > 0)
         if counts.mean() < 0.5:
             continue
+        if not goes_on(max(map(len, scores.values()))):
+            break
         row = [seen]
         for name, draw in products.items():
             drawn, covered = draw(T)

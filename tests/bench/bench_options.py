@@ -17,3 +17,4 @@ class DataOptions(BenchOptions):
     previews: Path | None = None  # folder for the previews of real flights, and for images
     scan: Path | None = None  # folder of the scan that ``screen`` shows
     flight: Path | None = None  # its recording, or the folder of its stills
+    frames: int = 8  # of these that ``screen`` draws, at most

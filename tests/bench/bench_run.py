@@ -49,12 +49,13 @@ def main(
     scans: Annotated[int, typer.Option(min=0, help="site: tiles of a site of so many scans")] = 0,
     scan: Annotated[Path | None, typer.Option(help="screen: folder of a scan")] = None,
     flight: Annotated[Path | None, typer.Option(help="screen: its recording or stills")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="screen: frames drawn at most")] = 8,
     kept: Annotated[
         Path | None, typer.Option("--keep", help="folder for result (JSON) and previews")
     ] = None,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
-    options = DataOptions(rounds, 3, backend, scans, data, kept, scan, flight)
+    options = DataOptions(rounds, 3, backend, scans, data, kept, scan, flight, frames)
     known = BENCHMARKS | DEVELOPMENT
     chosen = names or [name for name in known if name not in ASKED_FOR]
     try:

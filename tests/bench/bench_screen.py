@@ -1,9 +1,10 @@
-"""The portal's surface as it stands on the screen, at frames that took no part in the scan.
+"""The portal's screen at frames that took no part in the scan.
 
 A portal serves the scan to a headless Chromium, which looks from each frame's pose as people do:
-surfaces over the filled ground. What stands there is turned to the frame's own camera and scored
-as ``skyrelief score --views`` scores the products. The page brightens all colours by one factor;
-it is found at a keyframe, and taken back.
+at the layer that the scan opens with, which of a finished scan with ``mesh.glb`` is the mesh, and
+at the depth images over the filled ground. What stands there is turned to the frame's own camera
+and scored as ``skyrelief score --views`` scores the products. The page brightens all colours by one
+factor; it is found at a keyframe, and taken back.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import math
 import shutil
 import statistics
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +24,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from bench_options import DataOptions
-from person import Browser, chromium
+from person import Browser, Page, chromium
 from playwright.sync_api import sync_playwright
 
 from recon.types import F64, U8, Bool, Camera, Keyframe
@@ -31,7 +33,7 @@ from service.errors import InputError, OutsideError
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.offline.exports.view import ScanView
-from service.offline.view_scoring import frame_scores
+from service.offline.view_scoring import frame_scores, left_out
 from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
 
@@ -49,7 +51,15 @@ SETTING = """(() => {
   for (const kind of ['input', 'change'])
     field.dispatchEvent(new Event(kind, { bubbles: true }));
 })()"""
-WAIT_S, TRIES = 300.0, 8
+WAIT_S, TRIES = 180.0, 8
+LIMIT_S = 900.0
+"""No further frame is begun after so long: software rendering is slow on a busy machine."""
+
+GO_TO = """new Promise(done => {
+  addEventListener('hashchange', () => setTimeout(done, 0), { once: true });
+  location.hash = '%s';
+})"""
+PRESSED = "[...document.querySelectorAll('.tools button.on')].map(b => b.textContent).join()"
 ALL_SHOWN = """[...document.querySelectorAll('.figures div')]
   .some(row => row.textContent === 'Images%d')"""
 SIDE = """(() => {
@@ -67,13 +77,20 @@ def run(options: DataOptions) -> list[BenchResult]:
         raise OutsideError("bench screen needs Chromium; apt install chromium")
     if not (PAGE / "index.html").is_file():
         raise OutsideError("bench screen needs the portal's page; see CONTRIBUTING.md")
-    kept = options.previews
-    with ScanView(options.scan) as scan, _screen(scan) as screen:
+    kept, until = options.previews, time.monotonic() + LIMIT_S
+
+    def goes_on(done: int) -> bool:
+        return done < options.frames and time.monotonic() < until
+
+    with ScanView(options.scan) as scan, _screens(scan) as screens:
+        used = {k.time_ns for k in main_keyframes(scan.store)}
+        every = max(1, len(left_out(scan.poses, used, 1)) // options.frames)
         views = None if kept is None else kept / "views"
-        others = {"screen": screen.shaded, "screen without shading": screen.unshaded}
-        scores = frame_scores(scan, options.flight, views, others)
+        others = {screen.layer: screen.view for screen in screens}
+        scores = frame_scores(scan, options.flight, views, others, every, goes_on)
     if kept is not None:
         (kept / "frames.json").write_text(json.dumps(scores, indent=1))
+    late = f"; cut after {LIMIT_S:g} s" if time.monotonic() > until else ""
     middle = {
         name: [statistics.median(f) for f in zip(*rows, strict=True)]
         for name, rows in scores.items()
@@ -86,7 +103,7 @@ def run(options: DataOptions) -> list[BenchResult]:
             times * (max(row[n] for row in rows) - min(row[n] for row in rows)),
             "depth grids",
             times * middle["surface"][n],
-            note=f"mean {times * statistics.mean(row[n] for row in rows):.4g}",
+            note=f"mean {times * statistics.mean(row[n] for row in rows):.4g}{late}",
         )
         for name, rows in scores.items()
         for n, (figure, times, unit) in enumerate(FIGURES)
@@ -94,67 +111,61 @@ def run(options: DataOptions) -> list[BenchResult]:
 
 
 class Screen:
-    """What the page shows of a scan from a camera's place."""
+    """What a layer of the page shows of a scan from a camera's place."""
 
-    def __init__(self, browser: Browser, address: str, scan: ScanView) -> None:
-        self.browser, self.address = browser, address
+    def __init__(
+        self, browser: Page, address: str, scan: ScanView, is_meshed: bool, gain: float = 1.0
+    ) -> None:
+        """``gain`` is the factor of the page's colours, in linear light."""
+        self.browser, self.address, self.gain = browser, address, gain
         self.camera = camera_of(scan.store.header)
-        self.keyframes = sum(1 for _ in scan.store.keyframes())
         w, h = self.camera.size_px
         away = np.array([[0, 0], [w, 0], [0, h], [w, h]]) - self.camera.K[:2, 2]
         widest = np.arctan(np.hypot(*away.T).max() / self.camera.K[1, 1])
         self.degrees = math.ceil(2 * math.degrees(widest)) + 1  # however the image is turned
         self.side_px = math.ceil(2 * self.camera.K[1, 1] * math.tan(math.radians(self.degrees / 2)))
-        self.gain = 1.0
-        self.last: tuple[F64, list[U8], Bool] | None = None
-        keyframes = list(main_keyframes(scan.store))
-        self.gain = self._brightness(keyframes[len(keyframes) // 2])
+        browser.open(address)
+        keyframes = sum(1 for _ in scan.store.keyframes())
+        self._wait(ALL_SHOWN % keyframes, f"all {keyframes} keyframes")
+        if is_meshed:
+            self._wait("document.body.dataset.mesh === 'shown'", "the mesh")
+        self._fit()
+        self._set("Field of view", f"field.value = {self.degrees};")
+        self._set("Exposure", f"field.value = {DARKER_EV};")
 
-    def shaded(self, T: F64) -> tuple[U8, Bool]:
+    @property
+    def layer(self) -> str:
+        """What the page calls it."""
+        return "screen, mesh" if "Mesh" in self.browser.run(PRESSED) else "screen, surface"
+
+    def view(self, T: F64) -> tuple[U8, Bool]:
         """(H, W, 3) BGR and (H, W) covered pixels from a T_world_camera (4, 4)."""
-        images, covered = self._from(T)
-        return images[0], covered.copy()
-
-    def unshaded(self, T: F64) -> tuple[U8, Bool]:
-        """As ``shaded``, where the page's shading is off."""
-        images, covered = self._from(T)
-        return images[1], covered.copy()
-
-    def _from(self, T: F64) -> tuple[list[U8], Bool]:
-        if self.last is None or self.last[0] is not T:
-            self.last = (T, *self._seen(T))
-        return self.last[1:]
-
-    def _seen(self, T: F64) -> tuple[list[U8], Bool]:
-        """The camera's image as it is shown, without shading too, and where there is no sky."""
         eye = np.round(T[:3, 3], 3)
         aim = np.round(T[:3, 3] + AWAY_M * T[:3, 2], 3)
         if math.hypot(*(aim - eye)[:2]) < ASIDE_M:
             aim[1] += 2 * ASIDE_M
-        self._open(eye, aim)
-        dark = [self._image()]
-        self._set("Shading", "field.value = 0;")
-        dark.append(self._image())
+        place = ",".join(f"{value:.3f}" for value in (*eye, *aim))
+        self.browser.run(GO_TO % f"{self.address.split('#')[1]}/{place}")
+        dark = self._image()
         self._set("Light scene", "field.checked = true;")
         light = self._image()
+        self._set("Light scene", "field.checked = false;")
         H = to_camera(self.camera, T, eye, aim, self.degrees, self.side_px)
-        turned = [
+        dark, light = (
             np.asarray(cv2.warpPerspective(image, H, self.camera.size_px), np.uint8)
-            for image in (*dark, light)
-        ]
-        change = np.abs(turned[1].astype(int) - turned[2]).max(axis=2)
-        return [as_recorded(image, self.gain) for image in turned[:2]], change <= SAME
+            for image in (dark, light)
+        )
+        change = np.abs(dark.astype(int) - light).max(axis=2)
+        return as_recorded(dark, self.gain), change <= SAME
 
-    def _open(self, eye: F64, aim: F64) -> None:
-        """Waits until the view from ``eye`` to ``aim`` is drawn to the end."""
-        place = ",".join(f"{value:.3f}" for value in (*eye, *aim))
-        self.browser.open("about:blank")
-        self.browser.wait("location.href === 'about:blank'")
-        self.browser.open(f"{self.address}/{place}")
-        self.browser.wait(ALL_SHOWN % self.keyframes, WAIT_S)
-        self._fit()
-        self._set("Field of view", f"field.value = {self.degrees};")
-        self._set("Exposure", f"field.value = {DARKER_EV};")
+    def _wait(self, script: str, what: str) -> None:
+        try:
+            self.browser.wait(script, WAIT_S)
+        except RuntimeError as error:
+            raise OutsideError(
+                f"bench screen: the page did not show {what} in {WAIT_S:g} s; "
+                "try on a quiet machine, or with fewer --frames"
+            ) from error
 
     def _fit(self) -> None:
         """Makes the page so large that the scene has the camera's pixels."""
@@ -173,23 +184,24 @@ class Screen:
         self.browser.run(SETTING % (label, act))
 
     def _image(self) -> U8:
-        self.browser.wait("document.body.dataset.still === 'yes'", WAIT_S)
+        self._wait("document.body.dataset.still === 'yes'", "a frame drawn to the end")
         data = np.frombuffer(base64.b64decode(self.browser.run(IMAGE)), np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
-    def _brightness(self, keyframe: Keyframe) -> float:
-        """The factor of the page, in linear light: that of the middle pixel of a keyframe."""
-        images, covered = self._from(keyframe.depth.T_world_camera)
+    def find_gain(self, keyframe: Keyframe) -> None:
+        """That of the middle pixel of a keyframe, without the page's shading."""
+        self._set("Shading", "field.value = 0;")
+        image, covered = self.view(keyframe.depth.T_world_camera)
+        self._set("Shading", "field.value = 1;")
         size = (keyframe.bgr.shape[1], keyframe.bgr.shape[0])
-        shown = cv2.resize(images[1], size, interpolation=cv2.INTER_AREA)
+        shown = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         there = cv2.resize(covered.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         shared = there & keyframe.fresh
-        for image in (shown, keyframe.bgr):
-            shared &= (image.min(axis=2) >= DARK) & (image.max(axis=2) <= BRIGHT)
+        for one in (shown, keyframe.bgr):
+            shared &= (one.min(axis=2) >= DARK) & (one.max(axis=2) <= BRIGHT)
         if not shared.any():
             raise InputError("bench screen: the portal shows nothing of the middle keyframe")
-        self.last = None
-        return float(np.median(_linear(shown[shared]) / _linear(keyframe.bgr[shared])))
+        self.gain = float(np.median(_linear(shown[shared]) / _linear(keyframe.bgr[shared])))
 
 
 def to_camera(camera: Camera, T: F64, eye: F64, aim: F64, degrees: float, side_px: int) -> F64:
@@ -218,16 +230,28 @@ def _linear(srgb: npt.ArrayLike) -> F64:
 
 
 @contextmanager
-def _screen(scan: ScanView) -> Iterator[Screen]:
-    """The scan in a browser, before a portal that has nothing else."""
+def _screens(scan: ScanView) -> Iterator[list[Screen]]:
+    """The scan in a browser, before a portal that has nothing else: its depth images, and the mesh
+    where it opens as that. Both have the factor that is found at the depth images."""
+    keyframes = list(main_keyframes(scan.store))
     with tempfile.TemporaryDirectory() as root:
-        shutil.copytree(scan.folder, Path(root) / "scans" / "bench" / "screen")
+        folder = Path(root) / "scans" / "bench" / "screen"
+        shutil.copytree(scan.folder, folder, ignore=shutil.ignore_patterns("splat.ply", "*.mcap"))
         portal = Portal(PortalConfig(Path(root) / "scans", port=0))
         portal.start()
         try:
             with sync_playwright() as driver:
                 browser = Browser(driver)
-                yield Screen(browser, f"{portal.url.split('/?')[0]}/#/view/bench/screen", scan)
+                address = f"{portal.url.split('/?')[0]}/#/view/bench/screen"
+                is_meshed = portal.state.library.entry("bench", "screen")["meshed"]
+                surface = Screen(browser, address, scan, is_meshed)
+                if is_meshed:
+                    browser.click("Surface")
+                surface.find_gain(keyframes[len(keyframes) // 2])
+                screens = [surface]
+                if is_meshed:
+                    screens.append(Screen(browser.other(), address, scan, is_meshed, surface.gain))
+                yield screens
                 browser.close()
         finally:
             portal.close()

@@ -8,6 +8,7 @@ import { showLibrary } from "./library";
 const root = document.getElementById("app")!;
 let close: () => void = () => undefined;
 let turn = 0;
+let shown = ""; // page and scan
 
 async function show(): Promise<void> {
   const mine = ++turn;
@@ -47,9 +48,12 @@ function fail(error: unknown): void {
 }
 
 function start(): void {
-  const shown = show();
+  const asked = location.hash.split("/").slice(0, 4).join("/");
+  if (asked === shown && asked.startsWith("#/view/")) return; // the view itself goes to the place
+  shown = asked;
+  const showing = show();
   const mine = turn;
-  void shown.catch((error: unknown) => mine === turn && fail(error));
+  void showing.catch((error: unknown) => mine === turn && ((shown = ""), fail(error)));
 }
 addEventListener("hashchange", start);
 start();

@@ -109,6 +109,10 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
 
   let last: LastPose | undefined;
   let framed = takeView(stage, place);
+  const goTo = (): void => {
+    if (takeView(stage, location.hash.split("/")[4])) stage.touch();
+  };
+  addEventListener("hashchange", goTo);
   const reach = (): number => Math.max(cloud.reach || (last?.agl_m ?? 40), 5);
   const news = (item: News): void => {
     if (item.type === "link") return link.news(item);
@@ -169,6 +173,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     document.body.dataset["fps"] = stage.painter.frames_per_s.toFixed(1);
   }, 300);
   return () => {
+    removeEventListener("hashchange", goTo);
     clearInterval(clock);
     asked();
     images.close();
