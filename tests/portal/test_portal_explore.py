@@ -279,6 +279,17 @@ def test_a_link_opens_the_same_view(page: Browser) -> None:
     assert np.abs(view(page) - here).max() < 0.02
 
 
+def test_a_link_to_another_place_of_an_open_view_moves_the_camera(page: Browser) -> None:
+    page.run(
+        f"{{ window.before = {CANVAS}; location.hash = '#/view/drone-1/test-1/1,2,60,3,4,0' }}"
+    )
+    page.wait("document.body.dataset.still === 'no'")
+    settle(page)
+    np.testing.assert_allclose(view(page), [1, 2, 60, 3, 4, 0], atol=0.01)
+    assert page.run(f"window.before === {CANVAS}")  # nothing is loaded again
+    page.run("history.back()")
+
+
 def test_the_ground_is_not_looked_at_from_below(page: Browser) -> None:
     before = view(page)
     page.page.mouse.move(640, 700)
@@ -294,6 +305,8 @@ def test_the_ground_is_not_looked_at_from_below(page: Browser) -> None:
 def test_a_link_with_a_broken_view_shows_the_whole_site(
     browser: Browser, base: str, broken: str
 ) -> None:
+    browser.open("about:blank")
+    browser.wait("location.href === 'about:blank'")
     browser.open(f"{base}#/view/drone-1/test-1/{broken}")
     browser.wait("document.body.dataset.points > 71000")
     settle(browser)
