@@ -48,7 +48,7 @@ from service.ground.scan_files import file_routes
 from service.ground.sites import align_by_points
 from service.ground.state import KINDS, SILENT_S, PortalState, folder_of, names_of, state_of
 from service.ground.upload import Upload, check_parts
-from service.ground.vehicle import BUTTONS
+from service.ground.vehicle import Button
 from service.offline.exports.view import ExportOptions
 from service.offline.site.start import Pair
 from service.scans.annotations import (
@@ -122,10 +122,8 @@ class ImportOrder(Body):
 class VehicleOrder(Body):
     """An order to the companion."""
 
-    action: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(BUTTONS)})]
-    metres: (
-        Annotated[float, msgspec.Meta(extra_json_schema={"minimum": 0, "maximum": 1000})] | None
-    ) = None
+    action: Button
+    metres: Annotated[float, msgspec.Meta(ge=0, le=1000)] | None = None
 
 
 def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:

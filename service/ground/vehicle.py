@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from service.errors import InputError, OutsideError
 from service.ground.operator import Operator, order
@@ -16,7 +16,7 @@ from service.workers import Worker, Workers
 
 log = logging.getLogger(__name__)
 
-BUTTONS = ("start", "stop", "pause", "resume", "photo", "baseline")
+Button = Literal["start", "stop", "pause", "resume", "photo", "baseline"]
 """Commands that the portal offers; only ``baseline`` takes a value."""
 
 SEARCH_S = 5.0
@@ -59,17 +59,14 @@ class Vehicle:
                 self._operator.__exit__(None, None, None)
                 self._operator = None
 
-    def order(self, action: str, metres: float | None) -> dict[str, Any]:
+    def order(self, action: Button, metres: float | None) -> dict[str, Any]:
         """Send an order and return its answer; one at a time, but a stop waits for no other.
 
-        Raises InputError for an unknown one, OutsideError when it was not carried out.
+        Raises InputError for metres where they are missing or too much, OutsideError when it was
+        not carried out.
         """
-        if action not in BUTTONS:
-            raise InputError(f"action is one of {', '.join(BUTTONS)}")
         if (action == "baseline") != (metres is not None):
             raise InputError("baseline takes metres (0 follows the altitude); no other action does")
-        if metres is not None and not (math.isfinite(metres) and 0.0 <= metres <= 1000.0):
-            raise InputError("metres are 0 to 1000")
         with self._lock:
             operator = self._operator
         if operator is None:
