@@ -243,7 +243,7 @@ def fly(
             release_memory(collect=True)
             try:
                 summary |= write_deliverables(
-                    inputs.folder, store, {}, progress=_until_stopped(stop, progress)
+                    inputs.folder, store, progress=_until_stopped(stop, progress)
                 )
             except CancelledError:
                 summary["failed"] = {"files of the scan": "stopped; exports need scan.db alone"}

@@ -197,7 +197,7 @@ class Scanning:
         *,
         attempt: Callable[[ScanRun], object] | None = None,
         opener: Callable[[str], CameraSource] | None = None,
-        write: Callable[[Path, ScanStore, Any], object] | None = None,
+        write: Callable[[Path, ScanStore], object] | None = None,
         life: ScanLife | None = None,
         resumption: Resumption | None = None,
         workers: Workers = PROCESS,
@@ -576,7 +576,7 @@ class Scanning:
             nonlocal fault
             from service.scans.folder import write_deliverables
 
-            files = partial(self._write or write_deliverables, folder, store, {})
+            files = partial(self._write or write_deliverables, folder, store)
             fault = guarded(f"files of {folder.name}", files)
             with self._lock:
                 is_written.set()

@@ -93,7 +93,7 @@ def warm_up(config: Config, progress: Progress) -> tuple[float, int]:
             say = progress.counting(FRAMES)
             scan.run(Event(), lambda _: say(progress.text))
         summary = scan.close()
-        write_deliverables(Path(folder), store, {})
+        write_deliverables(Path(folder), store)
         store.close()
     marker = _marker(os.environ.get("NUMBA_CACHE_DIR", ""))
     if marker is not None:

@@ -247,7 +247,7 @@ class Library:
         header = header_in(source)
         self._check_new(header, source)
         with store_from_mcap(source, part / "scan.db") as store:
-            write_deliverables(part, store, {})
+            write_deliverables(part, store)
         return header
 
     def _copied(self, source: Path, part: Path) -> ScanHeader:

@@ -41,7 +41,7 @@ def folders_due(store: Path) -> list[Path]:
 def deliver(folder: Path) -> None:
     """Write the scan's deliverables; InputError names those which could not be made."""
     with ScanStore.peek(folder / "scan.db") as store:  # others may write
-        failed = write_deliverables(folder, store, {})["failed"]
+        failed = write_deliverables(folder, store)["failed"]
     if failed:
         why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
         raise InputError(f"some could not be made: {why}")

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, cast
 
 from service.errors import InputError, OutsideError, outside
 from service.offline.site import DRONE
@@ -275,7 +275,7 @@ TAKING = ".taking-"
 def take_in(
     store: Path,
     folder: Path,
-    deliver: Callable[[Path, ScanStore, dict[str, Any]], object] = write_deliverables,
+    deliver: Callable[[Path, ScanStore], object] = write_deliverables,
 ) -> list[Path]:
     """The scan folders under ``store`` that now hold what those in ``folder`` hold.
 
@@ -311,7 +311,7 @@ def _take(store: Path, folder: Path, deliver: Callable[..., object]) -> Path:
             is_known = path.exists()
             with ScanStore.open(path) if is_known else ScanStore.create(path, header) as target:
                 news = merge(source, target)
-                deliver(path.parent, target, {})
+                deliver(path.parent, target)
     log.info("%s/%s: %d records from %s", drone, scan, news, folder)
     return path.parent
 

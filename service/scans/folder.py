@@ -85,16 +85,12 @@ NO_GEOREFERENCE = (
 def write_deliverables(
     folder: Path,
     store: ScanStore,
-    extra: dict[str, Any],
     tiled: TiledCloud | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Write the scan folder's files from ``store``; returns the content of scan.json.
 
-    Args:
-        extra: more figures of the run, added under ``run`` in scan.json; empty where the files
-        shall be identical at both ends.
-        tiled: the cloud, where it is too large for memory.
+    ``tiled`` is the cloud, where it is too large for memory.
 
     A file that cannot be made is listed under ``failed``, with the reason, and logged; the others
     are written. Raises OutsideError, at the end, when the folder cannot be written.
@@ -107,7 +103,7 @@ def write_deliverables(
     release_memory()
     files.write_pieces()
     progress("writing the files")
-    _, summary = run_parallel(files.write_cloud, partial(files.draw, extra))
+    _, summary = run_parallel(files.write_cloud, files.draw)
     assert summary is not None
     failures = files.failures
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
@@ -193,9 +189,9 @@ class _Files:
         with self.failures.noted(COVERAGE):
             self._coverage = write_coverage_files(self._folder, LiveCoverage(self._store))
 
-    def summary(self, extra: dict[str, Any]) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         store, frame, fused = self._store, self._frame, self._fused
-        header, run = store.header, (store.summary or {}) | extra
+        header, run = store.header, store.summary or {}
         notes, origin = [*header.notes, *fused.notes], None
         if frame is None:
             notes.append(NO_GEOREFERENCE)
@@ -251,12 +247,12 @@ class _Files:
             with self.failures.noted(CLOUD):
                 self._write_laz([(self._fused.cloud, None, None)])
 
-    def draw(self, extra: dict[str, Any]) -> dict[str, Any]:
+    def draw(self) -> dict[str, Any]:
         """Write preview, thumbnail and report; returns the content of scan.json."""
         with self.failures.noted(PREVIEW):
             self._raster = surface(self._fused, self._cell_m)
         release_memory()  # so that what a step leaves does not add to the next
-        summary = self.summary(extra)
+        summary = self.summary()
         poses = main_poses(self._poses, stretches_apart(self._store))
         maps = None
         with self.failures.noted(PREVIEW):
@@ -421,6 +417,6 @@ def key_figures(summary: dict[str, Any]) -> list[str]:
 if __name__ == "__main__":
     try:
         with ScanStore.open(Path(sys.argv[1]) / "scan.db") as opened:
-            write_deliverables(Path(sys.argv[1]), opened, {})
+            write_deliverables(Path(sys.argv[1]), opened)
     except SkyreliefError as error:
         sys.exit(str(error))

@@ -93,7 +93,7 @@ def measure(keyframes: int) -> Flown:
         from_s, before, _ = next(s for s in seen if s[1] >= (1.0 - LAST) * done)
         del scan
         start = time.process_time()
-        summary = write_deliverables(folder / "scan", store, {})
+        summary = write_deliverables(folder / "scan", store)
         files_s = time.process_time() - start
         store.close()
         stored = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

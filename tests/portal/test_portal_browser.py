@@ -151,7 +151,7 @@ def test_a_finished_scan_opens_as_its_mesh(browser: Browser, portal: Portal, sca
     folder = scans / "drone-1/test-1"
     with ScanStore.open(folder / "scan.db") as store:
         store.finish({})
-        write_deliverables(folder, store, {})
+        write_deliverables(folder, store)
     browser.open("about:blank")
     browser.wait("location.href === 'about:blank'")
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")
@@ -431,7 +431,7 @@ def test_what_is_new_since_the_last_visit_has_its_colours(browser: Browser, tmp_
     boxes: list[Box] = [(2.0, 3.0, 7.0, 7.0, 1.5), (-9.0, -7.0, -4.0, -3.0, 1.5)]
     last = write_scan(tmp_path / "a/may", leg(0.0), Errors((1.1, -0.7, 0.9)), boxes[:1], day=-30)
     with ScanStore.open(last / "scan.db") as store:
-        write_deliverables(last, store, {})
+        write_deliverables(last, store)
     for path in last.glob("scan.db*"):
         os.utime(path, (0, 0))
     now = write_scan(tmp_path / "b/june", leg(np.pi / 2), None, boxes[1:], finished=False)

@@ -146,7 +146,7 @@ def test_a_finished_scan_is_said_to_be_finished_while_it_loads(
     folder = scans / "drone-1/test-1"
     with ScanStore.open(folder / "scan.db") as store:
         store.finish({})
-        write_deliverables(folder, store, {})
+        write_deliverables(folder, store)
     with page_of(browser, scans, []) as base:
         browser.open(f"{base}/#/view/drone-1/test-1")
         browser.wait("document.body.dataset.points === '72000'")
@@ -228,7 +228,7 @@ def test_the_list_follows_the_server(browser: Browser, scans: Path, house: House
             one = house.keyframe(5, 30.0)
             store.add_keyframe(5, encode(one, one.time_ns))
             store.finish({})
-            write_deliverables(folder, store, {})
+            write_deliverables(folder, store)
         browser.wait("document.querySelectorAll('.badge').length === 1", 20)
         first = (
             "[...document.querySelectorAll('article')].find(a => a.textContent.includes('drone-1'))"

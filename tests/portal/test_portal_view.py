@@ -78,7 +78,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
     folder = root / "drone-1" / "test-1"
     with house.flown(folder) as scan:
         scan.finish({"scale": {"from": "gnss", "sigma": 0.0065}})
-        write_deliverables(folder, scan, {})
+        write_deliverables(folder, scan)
     return root
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @pytest.mark.skipif(not chromium(), reason="needs Chromium")
 def test_each_section_begins_a_page(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
-        write_deliverables(tmp_path, store, {})
+        write_deliverables(tmp_path, store)
     api = pytest.importorskip("playwright.sync_api")
     with api.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium(), args=FLAGS.split())

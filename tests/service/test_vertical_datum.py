@@ -235,7 +235,7 @@ def test_heights_above_what_the_tags_state(scan_dir: Path) -> None:
 
     with ScanStore.open(scan_dir / "scan.db") as store:
         store.update_header(vertical_datum="ellipsoid")
-        write_deliverables(scan_dir, store, {})
+        write_deliverables(scan_dir, store)
     facts = json.loads((scan_dir / "scan.json").read_text())
     assert facts["heights"] == "metres above ellipsoid"
     with ScanView(scan_dir) as scan:

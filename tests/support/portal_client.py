@@ -86,7 +86,7 @@ def _finished(house: HouseFlight) -> tempfile.TemporaryDirectory[str]:
     """The scan and its files, made once."""
     folder = tempfile.TemporaryDirectory()
     with house.flown(Path(folder.name)) as scan:
-        write_deliverables(Path(folder.name), scan, {})
+        write_deliverables(Path(folder.name), scan)
     return folder
 
 

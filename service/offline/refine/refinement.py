@@ -160,7 +160,7 @@ def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> SelfCalib
 def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
     with ScanStore.open(target / "scan.db") as store:
         store.hold_decoded()
-        write_deliverables(target, store, {})
+        write_deliverables(target, store)
     return figures | {"scan_folder": str(target)}
 
 

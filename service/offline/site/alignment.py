@@ -111,7 +111,7 @@ def write_files(
                 points_of(view, options, is_classified=False), options.voxel_m or cut.sample_m,
                 cut.sample_m, len(cut.prints), sum(p.points for p in cut.prints), cut.bounds,
             )  # fmt: skip
-        write_deliverables(folder, store, {}, tiled=tiled)
+        write_deliverables(folder, store, tiled=tiled)
 
 
 @contextlib.contextmanager

@@ -25,7 +25,7 @@ class Slow:
         self.error: Exception | None = None
         self.written: list[str] = []
 
-    def __call__(self, folder: Path, store: ScanStore, extra: object) -> None:
+    def __call__(self, folder: Path, store: ScanStore) -> None:
         self.may_end.wait(30.0)
         if self.error is not None:
             raise self.error

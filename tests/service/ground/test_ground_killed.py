@@ -120,8 +120,8 @@ def test_killed_and_restarted_on_both_sides(tmp_path: Path) -> None:
         for left, right in zip(a.keyframes(), b.keyframes(), strict=True):
             np.testing.assert_array_equal(left.depth.depth_m, right.depth.depth_m)
             np.testing.assert_array_equal(left.bgr, right.bgr)
-        write_deliverables(tmp_path, a, {})
-        write_deliverables(received.parent, b, {})
+        write_deliverables(tmp_path, a)
+        write_deliverables(received.parent, b)
     for name in (CLOUD, TUM, CSV, PREVIEW):
         assert (tmp_path / name).read_bytes() == (received.parent / name).read_bytes(), name
 

@@ -39,7 +39,7 @@ def flying(folder: Path, poses: list[F64], errors: Errors | None = None) -> Path
 def landed(folder: Path, poses: list[F64], errors: Errors | None = None) -> Path:
     write_scan(folder, poses, errors)
     with ScanStore.open(folder / "scan.db") as store:
-        write_deliverables(folder, store, {})
+        write_deliverables(folder, store)
     return rested(folder)
 
 
@@ -109,7 +109,7 @@ def test_the_last_visit_is_shown_as_an_earlier_date(tmp_path: Path) -> None:
     for name, day in (("april", -60), ("may", -30)):
         scan = write_scan(tmp_path / name / "1", NORTH, day=day)
         with ScanStore.open(scan / "scan.db") as store:
-            write_deliverables(scan, store, {})
+            write_deliverables(scan, store)
         rested(scan)
     may, now = tmp_path / "may" / "1", START_NS / 1e9
     here, elsewhere = (FRAME.lat_deg, FRAME.lon_deg), (FRAME.lat_deg + 0.01, FRAME.lon_deg)

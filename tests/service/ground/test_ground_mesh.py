@@ -25,7 +25,7 @@ def folder(tmp_path: Path, house: HouseFlight) -> Path:
     folder = flown_store(tmp_path / "scans", house) / "drone-1/test-1"
     with ScanStore.open(folder / "scan.db") as store:
         store.finish({})
-        write_deliverables(folder, store, {})
+        write_deliverables(folder, store)
     return folder
 
 

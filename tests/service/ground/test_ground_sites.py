@@ -89,7 +89,7 @@ def working(tmp_path: Path) -> Iterator[tuple[Sites, Worker]]:
 def flown(folder: Path, heading: float, errors: Errors) -> Path:
     write_scan(folder, leg(heading), errors)
     with ScanStore.open(folder / "scan.db") as store:
-        write_deliverables(folder, store, {})
+        write_deliverables(folder, store)
     return folder
 
 

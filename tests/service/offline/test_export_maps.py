@@ -203,7 +203,7 @@ def test_level_ground_with_a_house_has_no_contours(maps: Path) -> None:
 def test_the_report_shows_orthophoto_and_surface_model(tmp_path: Path, house: HouseFlight) -> None:
     folder = tmp_path / "scan"
     with house.flown(folder) as store:
-        heights = write_deliverables(folder, store, {})["heights"]
+        heights = write_deliverables(folder, store)["heights"]
     frame, options = LocalFrame(*house.origin), ExportOptions(cell_m=0.25)
     assert made_maps(folder, frame, heights) is None
     before = (folder / "report.html").read_text()

@@ -79,7 +79,7 @@ def test_impossible_records_in_a_store_change_no_file(tmp_path: Path, house: Hou
     db.close()
     for name in ("honest", "hostile"):
         with ScanStore.open(tmp_path / name / "scan.db") as store:
-            assert write_deliverables(tmp_path / name, store, {})["failed"] == {}
+            assert write_deliverables(tmp_path / name, store)["failed"] == {}
     for file in (CLOUD, TUM, CSV, PREVIEW, "coverage.png", "scan.json"):
         honest, hostile = (tmp_path / name / file for name in ("honest", "hostile"))
         assert honest.read_bytes() == hostile.read_bytes(), file
@@ -134,7 +134,7 @@ def test_extreme_records_within_bounds_give_files_or_one_line(
     monkeypatch.setattr(raster, "MIN_CELLS", raster.MIN_CELLS // 10)
     with house.flown(tmp_path) as store:
         change(store, house)
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     assert summary["failed"] == {} and summary["counts"]["points"] > 0
     json.loads((tmp_path / "scan.json").read_text(), parse_constant=pytest.fail)
     for kind in ("dsm", "contours", "mcap", "geojson", "coverage"):

@@ -191,7 +191,7 @@ def finished(store: ScanStore, apart: list[list[int]]) -> ScanStore:
 def test_no_deliverable_shows_what_is_apart(tmp_path: Path, house: HouseFlight) -> None:
     """The last two keyframes of five are tied to nothing: they lie 5 m further east each."""
     with finished(house.flown(tmp_path), [[3, 4]]) as store:
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
         coverage = coverage_of(store)
     assert coverage is not None and coverage.places["seq"].tolist() == [0, 1, 2]
     assert any("2 of 5 keyframes" in note for note in summary["notes"])
@@ -212,7 +212,7 @@ def test_a_scan_of_false_depth_alone_shows_none(tmp_path: Path, house: HouseFlig
     """Images that tie its keyframes place them, and make their depth no truer."""
     with house.flown(tmp_path) as store:
         store.finish({"frames": 5, "frames_tracked": 5, "apart": [[0, 4]], "false": [[0, 4]]})
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
         set_refinement(store, {"apart": []})
         assert not main_seqs(store)
     assert summary["counts"]["points"] == 0 and not summary["failed"]
@@ -229,7 +229,7 @@ def test_a_piece_that_nothing_ties_is_a_cloud_of_its_own(
 ) -> None:
     """Three keyframes from 10 m east on, 40 m above the ground; two more are too few."""
     with finished(house.flown(tmp_path), [[2, 4], [0, 1], *[[2, 9]] * 100]) as store:
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
         first = store.keyframe(2)
         assert first is not None
         assert [path.name for path in tmp_path.glob("piece-*")] == ["piece-1.laz"]
@@ -239,7 +239,7 @@ def test_a_piece_that_nothing_ties_is_a_cloud_of_its_own(
         assert len(piece) > 1000 and abs(np.median(piece.z) + high_m) < 1.0
         assert abs(np.median(piece.x)) < 20.0 and piece.header.parse_crs() is None
         set_refinement(store, {"apart": []})
-        write_deliverables(tmp_path, store, {})
+        write_deliverables(tmp_path, store)
     assert not list(tmp_path.glob("piece-*"))
 
 
@@ -247,7 +247,7 @@ def test_the_preview_says_what_is_left_out(tmp_path: Path, house: HouseFlight) -
     sizes = []
     for name, apart in (("whole", []), ("apart", [[3, 4]])):
         with finished(house.flown(tmp_path / name), apart) as store:
-            write_deliverables(tmp_path / name, store, {})
+            write_deliverables(tmp_path / name, store)
         image = cv2.imread(str(tmp_path / name / "preview.jpg"))
         assert image is not None
         sizes.append(image.shape)

@@ -258,7 +258,7 @@ def test_a_fine_layer_that_comes_later_is_taken_in(tmp_path: Path, house: HouseF
 def test_image_figures_and_geotiff(tmp_path: Path, house: HouseFlight) -> None:
     rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     with house.flown(tmp_path) as store:
-        write_deliverables(tmp_path, store, {})
+        write_deliverables(tmp_path, store)
         found = coverage_of(store)
     assert found is not None
     image = cv2.imread(str(tmp_path / IMAGE), cv2.IMREAD_UNCHANGED)
@@ -286,7 +286,7 @@ def test_without_a_surface_there_is_no_layer(tmp_path: Path, house: HouseFlight)
 
     with ScanStore.create(tmp_path / "two" / "scan.db", header) as empty:
         assert coverage_of(empty) is None
-        summary = write_deliverables(tmp_path / "two", empty, {})
+        summary = write_deliverables(tmp_path / "two", empty)
     assert summary["coverage"] is None and not (tmp_path / "two" / IMAGE).exists()
     with pytest.raises(InputError, match="nothing to export"), ScanView(tmp_path / "two") as scan:
         export(scan, "coverage", None, ExportOptions())

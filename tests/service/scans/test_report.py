@@ -144,7 +144,7 @@ def test_overlap_is_that_of_footprints(house: HouseFlight) -> None:
 def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
         store.finish(SUMMARY["run"])
-        summary, poses = write_deliverables(tmp_path, store, {}), store.poses()
+        summary, poses = write_deliverables(tmp_path, store), store.poses()
     assert key_figures(summary)[2] == "georeferenced"  # the preview states it without reasons too
     page = (tmp_path / "report.html").read_text()
     assert "Consistency" in page and "GNSS position" in page

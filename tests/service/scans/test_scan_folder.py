@@ -54,7 +54,7 @@ def test_writing_the_files_reports_how_far_it_is(tmp_path: Path, house: HouseFli
     reported: list[tuple[str, float]] = []
     progress = Progress(lambda p: reported.append((p.text, p.share)))
     with house.flown(tmp_path) as store, progress.part("the files", 0.5):
-        write_deliverables(tmp_path, store, {}, progress=progress)
+        write_deliverables(tmp_path, store, progress=progress)
     shares = [share for _, share in reported]
     assert shares == sorted(shares) and len(set(shares)) > 5 and 0.3 < shares[-1] < 0.5
     assert "fusing the cloud" in dict(reported) and reported[-1][0] == "writing the files"
@@ -62,7 +62,7 @@ def test_writing_the_files_reports_how_far_it_is(tmp_path: Path, house: HouseFli
 
 def test_cloud_is_where_the_house_stands(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     cloud = laspy.read(tmp_path / CLOUD)
     assert (cloud.header.version.major, cloud.header.version.minor) == (1, 4)
     assert cloud.header.point_format.id == 7
@@ -94,7 +94,7 @@ def test_heights_in_the_world_are_as_sure_as_the_scale(tmp_path: Path, house: Ho
     """5 % of 40 m, and of 34 m to the roof."""
     with house.flown(tmp_path) as store:
         store.finish({"scale": {"sigma": 0.05}})
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     cloud = laspy.read(tmp_path / CLOUD)
     enu, whole = enu_of(cloud, house), np.asarray(cloud["sigma_absolute_m"])
     assert np.median(whole[enu[:, 2] > 5.0]) == pytest.approx(1.7, abs=0.1)
@@ -105,10 +105,10 @@ def test_heights_in_the_world_are_as_sure_as_the_scale(tmp_path: Path, house: Ho
 
 def test_voxels_are_as_fine_as_the_pixels_on_the_ground(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
         coarse = fused_cloud(store, 1.0)
         store.update_header(configuration={"scan": {"resolution_m": 1.0}})  # the operator's wish
-        wished = write_deliverables(tmp_path, store, {})
+        wished = write_deliverables(tmp_path, store)
     assert wished["quality"]["voxel_m"] == 1.0
     assert wished["counts"]["points"] == len(coarse.cloud)
     assert summary["quality"]["voxel_m"] == pytest.approx(40 / 140, abs=1e-3)
@@ -124,8 +124,8 @@ def test_both_ends_write_the_same_bytes(tmp_path: Path, house: HouseFlight) -> N
                 data = air.record(kind, number)
                 assert data is not None
                 ground.put_record(kind, number, data)
-        write_deliverables(tmp_path / "air", air, {})
-        write_deliverables(tmp_path / "ground", ground, {})
+        write_deliverables(tmp_path / "air", air)
+        write_deliverables(tmp_path / "ground", ground)
         ground.close()
     for name in (CLOUD, TUM, CSV, SUMMARY, PREVIEW, REPORT):
         assert (tmp_path / "air" / name).read_bytes() == (tmp_path / "ground" / name).read_bytes()
@@ -133,7 +133,7 @@ def test_both_ends_write_the_same_bytes(tmp_path: Path, house: HouseFlight) -> N
 
 def test_trajectory_files(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
-        write_deliverables(tmp_path, store, {})
+        write_deliverables(tmp_path, store)
     rows = [line.split() for line in (tmp_path / TUM).read_text().splitlines()]
     assert rows[1][0] == "1700000001.123456789"
     numbers = np.array(rows, float)
@@ -154,7 +154,7 @@ def test_a_pose_written_again_replaces_the_first(tmp_path: Path, house: HouseFli
     with house.flown(tmp_path) as store:
         store.add_pose(house.record(2, 11.5))
         poses = store.poses()
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     assert len(poses) == 5
     numbers = np.loadtxt(tmp_path / TUM)
     np.testing.assert_allclose(numbers[:, 1], [0.0, 5.0, 11.5, 15.0, 20.0])
@@ -169,7 +169,7 @@ def test_a_reposed_keyframe_moves_its_points(tmp_path: Path, house: HouseFlight)
         for seq in range(5):
             T = se3.compose(house.nadir, np.array([5.0 * seq + 100.0, 0.0, house.height_m]))
             store.add_reposes([Repose(seq, 1, T, 1.0, np.eye(6))])
-        write_deliverables(tmp_path, store, {})
+        write_deliverables(tmp_path, store)
     enu = enu_of(laspy.read(tmp_path / CLOUD), house)
     assert np.median(enu[enu[:, 2] > 5.5, 0]) == pytest.approx(110.0, abs=0.3)
 
@@ -178,7 +178,8 @@ def test_without_georeference_the_cloud_is_local_and_says_so(
     tmp_path: Path, house: HouseFlight
 ) -> None:
     with house.flown(tmp_path, georeferenced=False) as store:
-        summary = write_deliverables(tmp_path, store, {"drops": 3})
+        store.finish({"drops": {"late": 3}})
+        summary = write_deliverables(tmp_path, store)
     cloud = laspy.read(tmp_path / CLOUD)
     assert cloud.header.parse_crs() is None
     assert np.abs(cloud.x).max() < 60
@@ -187,12 +188,12 @@ def test_without_georeference_the_cloud_is_local_and_says_so(
     assert written == summary
     assert written["epsg"] is None and written["origin"] is None
     assert any("no georeference" in note for note in written["notes"])
-    assert written["run"] == {"drops": 3}
+    assert written["run"] == {"drops": {"late": 3}}
 
 
 def test_an_empty_scan_still_makes_every_file(tmp_path: Path, house: HouseFlight) -> None:
     store = ScanStore.create(tmp_path / "scan.db", ScanHeader("empty", "d", house.start_ns))
-    summary = write_deliverables(tmp_path, store, {})
+    summary = write_deliverables(tmp_path, store)
     store.close()
     assert summary["counts"] == {
         "keyframes": 0,
@@ -209,7 +210,7 @@ def test_the_thumbnail_shows_the_ground_alone_within_the_extent(
     tmp_path: Path, house: HouseFlight
 ) -> None:
     with house.flown(tmp_path) as store:
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     image = cv2.imread(str(tmp_path / THUMBNAIL), cv2.IMREAD_UNCHANGED)
     assert image is not None and max(image.shape) == 480 and image.shape[2] == 4
     west, south, east, north = summary["coverage"]["bounds_m"]
@@ -225,7 +226,8 @@ def test_preview_and_report_say_what_limits_the_trust(tmp_path: Path, house: Hou
     rows = []
     for name, assumed in (("sure", []), ("lens", ["lens", "level", "height"])):
         with house.flown(tmp_path / name) as store:
-            summary = write_deliverables(tmp_path / name, store, {"assumed": assumed})
+            store.finish({"assumed": assumed})
+            summary = write_deliverables(tmp_path / name, store)
         image = cv2.imread(str(tmp_path / name / PREVIEW))
         assert image is not None
         rows.append(len(image))
@@ -239,8 +241,8 @@ def test_nothing_half_written_is_left(tmp_path: Path, house: HouseFlight) -> Non
         (tmp_path / "blocked").mkdir()
         (tmp_path / "blocked" / CLOUD).mkdir()  # a folder where the file should go
         with pytest.raises(OutsideError, match=CLOUD):
-            write_deliverables(tmp_path / "blocked", store, {})
-        write_deliverables(tmp_path, store, {})
+            write_deliverables(tmp_path / "blocked", store)
+        write_deliverables(tmp_path, store)
     assert not list(tmp_path.rglob("*.part"))
 
 
@@ -250,7 +252,8 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
     with house.flown(tmp_path) as store:
         store.update_header(notes=("<script>alert(1)</script>",))
         run = {"frames": 5, "refusals": {"too <little> motion": 3}, "stage_ms": {"track": 2.5}}
-        write_deliverables(tmp_path, store, run)
+        store.finish(run)
+        write_deliverables(tmp_path, store)
     page = (tmp_path / REPORT).read_text()
     assert "<script" not in page and "&lt;script&gt;" in page
     assert "too &lt;little&gt; motion" in page
@@ -303,7 +306,7 @@ def test_a_file_that_cannot_be_made_costs_itself_only(
 
     monkeypatch.setattr("service.scans.folder.write_laz", broken)
     with house.flown(tmp_path) as store:
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     why = {CLOUD: "OverflowError: cannot convert float infinity to integer"}
     trouble = facts_of(tmp_path)["trouble"]  # what the portal's list shows
     assert trouble == f"could not be made: {CLOUD} ({why[CLOUD]})"
@@ -322,7 +325,7 @@ def test_without_a_cloud_the_track_is_still_written(
     monkeypatch.setattr("service.scans.folder.fused_cloud", broken)
     monkeypatch.setattr("service.scans.folder.write_coverage_files", broken)
     with house.flown(tmp_path) as store:
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     assert set(summary["failed"]) == {CLOUD, "coverage.png"}
     assert summary["counts"]["poses"] == 5
     assert len((tmp_path / TUM).read_text().splitlines()) == 5
@@ -337,7 +340,7 @@ def test_a_file_that_the_disk_refused_is_tried_again_at_the_next_start(
         store.finish({"points": 1})
         (folder / PREVIEW / "in the way").mkdir(parents=True)
         with pytest.raises(OutsideError, match=PREVIEW):
-            write_deliverables(folder, store, {})
+            write_deliverables(folder, store)
     assert list(json.loads((folder / SUMMARY).read_text())["failed"]) == [PREVIEW]
     assert all((folder / name).stat().st_size for name in (CLOUD, TUM, CSV, REPORT))
     (folder / PREVIEW / "in the way").rmdir()
