@@ -129,17 +129,12 @@ def _nodes(x: F64) -> tuple[F64, F64]:
     return nodes, np.column_stack([np.interp(x, nodes, one) for one in np.eye(NODES)])
 
 
-def unwrapped(lon_deg: Array) -> F64:
-    """Longitudes (N,) without a step at 180 degrees, so that some may lie beyond it."""
-    return np.asarray(np.unwrap(np.asarray(lon_deg, np.float64), period=360.0))
-
-
 def cut_at_180(places: F64) -> list[F64]:
     """A line (N, K) of longitude, latitude and more columns, cut where it crosses 180 degrees.
 
     The parts end at -180 or 180, as RFC 7946 (3.1.9) asks for.
     """
-    lon = unwrapped(places[:, 0])
+    lon = np.unwrap(places[:, 0], period=360.0)  # without a step at 180 degrees
     turns = np.floor((lon + 180.0) / 360.0)  # a piece of the line lies in one turn
     parts, first = [], 0
     row = np.column_stack([lon, places[:, 1:]])

@@ -30,7 +30,7 @@ from service.daemon.vehicle_config import vehicle_config, watch_config
 from service.daemon.warm_up import is_warm, warm_up_command
 from service.errors import InputError, NoSenderError, SkyreliefError
 from service.packages import installs, unusable_packages
-from service.scans.retention import existing
+from service.scans.writing import existing
 
 if TYPE_CHECKING:
     from mavlink.wire.messages import LinkReport

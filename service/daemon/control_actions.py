@@ -26,7 +26,7 @@ from service.daemon.scanning import Scanning
 from service.daemon.stored_image import MIN_FREE_MIB
 from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
-from service.scans.retention import existing
+from service.scans.writing import existing
 from service.workers import PROCESS
 
 DISK_AGE_S = 1.0

@@ -16,7 +16,7 @@ from typing import Any
 import psutil  # type: ignore[import-untyped]
 
 from mavlink.component.status import ComputerLoad
-from service.scans.retention import existing
+from service.scans.writing import existing
 
 THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttled, soft limit
 

@@ -189,13 +189,13 @@ class SiteNews:
         with contextlib.suppress(InputError):
             scans = read_strictly(self._path, list[Shown])
         own = next((one for one in scans if (one.drone, one.scan) == self._names), None)
-        near = [one for one in scans if own and _is_for(own, one)]
-        return json.dumps({"type": "site", "scans": [_entry(own, one) for one in near if own]})
-
-
-def _is_for(own: Shown, one: Shown) -> bool:
-    """True for a scan tied to this one, and not of a later visit."""
-    return one.group == own.group and one.started_unix_s <= own.started_unix_s + SAME_VISIT_S
+        shown = [
+            _entry(own, one)
+            for one in scans
+            if own is not None and one.group == own.group  # and not of a later visit
+            if one.started_unix_s <= own.started_unix_s + SAME_VISIT_S
+        ]
+        return json.dumps({"type": "site", "scans": shown})
 
 
 def _entry(own: Shown, one: Shown) -> dict[str, object]:

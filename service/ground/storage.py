@@ -24,7 +24,8 @@ from typing import IO, cast
 from service.errors import InputError, OutsideError, outside
 from service.offline.site import DRONE
 from service.scans.folder import write_deliverables
-from service.scans.retention import Claim, existing
+from service.scans.retention import Claim
+from service.scans.writing import existing
 from service.stream.naming import check_name, split_scan_name
 from service.stream.store import ScanStore, header_of
 

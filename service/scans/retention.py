@@ -92,13 +92,6 @@ def make_room(
     return deleted
 
 
-def existing(folder: Path) -> Path:
-    """The folder, or the nearest of its parents that can be found."""
-    while not os.path.exists(folder) and folder != folder.parent:
-        folder = folder.parent
-    return folder
-
-
 def _finished(scan: Path) -> bool:
     from service.stream.store import ScanStore
 

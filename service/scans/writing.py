@@ -79,13 +79,18 @@ def check_writable(path: Path, is_folder: bool = False) -> None:
     """
     if path.exists() and path.is_dir() != is_folder:
         raise InputError(f"{path} is a {'file' if is_folder else 'folder'}; give another --out")
-    there = path if path.is_dir() else path.parent
-    while not there.exists():
-        there = there.parent
+    there = existing(path if path.is_dir() else path.parent)
     if not there.is_dir():
         raise InputError(f"{path}: {there} is a file, not a folder; give another --out")
     if not os.access(there, os.W_OK | os.X_OK):
         raise OutsideError(f"cannot write {path}: no rights to write in {there}")
+
+
+def existing(folder: Path) -> Path:
+    """The folder, or the nearest of its parents that can be found."""
+    while not os.path.exists(folder) and folder != folder.parent:
+        folder = folder.parent
+    return folder
 
 
 @contextmanager

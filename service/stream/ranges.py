@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from array import array
 from bisect import bisect_left, bisect_right
@@ -129,15 +130,11 @@ class RangeSet:
 def ranges_from_text(text: str) -> RangeSet | None:
     """The set that :meth:`RangeSet.text` wrote; None for anything else."""
     pairs: Pairs = []
-    if text.count(",") >= MAX_RANGES:
-        return None
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        if not (first.isascii() and first.isdigit() and len(first) <= 10):
+    for part in text.split(",", MAX_RANGES):
+        found = re.fullmatch(r"(\d{1,10})(?:-(\d{1,10}))?", part, re.ASCII)
+        if found is None:
             return None
-        if last and not (last.isascii() and last.isdigit() and len(last) <= 10):
-            return None
-        pairs.append((int(first), int(last or first)))
+        pairs.append((int(found[1]), int(found[2] or found[1])))
     return ranges_from_pairs(pairs)
 
 
