@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from recon import se3
-from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
+from recon.pipeline.keyframe_map import KeyframeMap
 from recon.posegraph.pose_priors import dead_reckoned
 from recon.poses import carried
-from recon.tracking.frame import Frame, RelativePose, Tracking
+from recon.tracking.frame import Frame, Tracking
 from recon.types import F64, Pose, PosePrior
 
 
@@ -27,13 +27,13 @@ def pose_at(
 
 
 class FramePoses:
-    """Places frames by the :class:`GraphUpdate` of the newest view, so that they never wait for
-    the graph; by the graph itself after :meth:`finish`."""
+    """Places frames by the pose of the newest view, so that they never wait for the graph; by the
+    graph itself after :meth:`finish`."""
 
-    def __init__(self, keyframes: KeyframeMap, is_settled: Callable[[RelativePose], bool]) -> None:
+    def __init__(self, keyframes: KeyframeMap, is_settled: Callable[[Frame], bool]) -> None:
         """``is_settled`` marks frames whose reference keyframe is no longer adjusted."""
         self._map, self._is_settled = keyframes, is_settled
-        self._views: list[RelativePose] = []  # reconstructed, in order
+        self._views: list[Frame] = []  # reconstructed, in order
         self._settled = 0  # the first so many no longer change
         # By segment, of its last frame with a fix: place in the odometry, fix, sigma, sources.
         self._fallbacks: dict[int, tuple[F64, F64, F64, tuple[str, ...]]] = {}
@@ -41,11 +41,11 @@ class FramePoses:
         self._newest: Pose | None = None  # of a view; None again once all is done
         self._aligned = -1  # the newest segment that has a similarity to the world
 
-    def add_view(self, view: RelativePose, update: GraphUpdate) -> None:
-        """Let a view that is in the graph carry frames from now on."""
+    def add_view(self, view: Frame, pose: Pose) -> None:
+        """Let a view that is in the graph, at a pose, carry frames from now on."""
         self._views.append(view)
-        self._newest = update.pose
-        self._aligned = view.segment if update.is_placed else self._aligned
+        self._newest = pose
+        self._aligned = view.segment if pose.is_aligned else self._aligned
 
     def settle(self) -> None:
         """Release the keyframes that no longer change."""
@@ -61,19 +61,19 @@ class FramePoses:
 
     def place(self, frame: Frame) -> Pose | None:
         """A new frame in the world, by vision or else by telemetry; None where neither tells."""
-        prior, relative = frame.prior, frame.relative
-        if relative is None:
-            return self._by_telemetry(prior) if frame.state is Tracking.LOST else None
-        pose = self.pose(relative, self._fallback(prior, relative))
-        self._seen = prior, pose, frame.segment
+        if not frame.is_placed:
+            return self._by_telemetry(frame.prior) if frame.state is Tracking.LOST else None
+        pose = self.pose(frame, self._fallback(frame))
+        self._seen = frame.prior, pose, frame.segment
         return pose
 
-    def _fallback(self, prior: PosePrior, frame: RelativePose) -> Pose:
+    def _fallback(self, frame: Frame) -> Pose:
         """A frame at its fix, or as far from the last one as the odometry has it.
 
         Heading and scale of the odometry are not known: the sigma grows by the way.
         """
-        at_m, fix, sigma = frame.T_odom_camera[:3, 3], prior.position_m, prior.sigma_position_m
+        at_m, prior = frame.T_odom_camera[:3, 3], frame.prior
+        fix, sigma = prior.position_m, prior.sigma_position_m
         if fix is not None and sigma is not None:
             self._fallbacks[frame.segment] = at_m, fix, sigma, ("gnss",)
         start = at_m, at_m, np.ones(3), ("vision",)
@@ -91,7 +91,7 @@ class FramePoses:
             return segment == self._aligned
         return self._map.graph.segments[segment].similarity is not None
 
-    def pose(self, frame: RelativePose, fallback: Pose) -> Pose:
+    def pose(self, frame: Frame, fallback: Pose) -> Pose:
         """A frame in the world, carried by the view at or before it where it can.
 
         A segment too short to be aligned has no scale and no heading: its frames stay at their
@@ -106,7 +106,7 @@ class FramePoses:
         after = self._map.graph.refuted.get(view.seq) if self._newest is None else None
         return pose if after is None else self._doubted(pose, view.seq, after)
 
-    def _view_of(self, frame: RelativePose) -> RelativePose | None:
+    def _view_of(self, frame: Frame) -> Frame | None:
         """The view at or before a frame, or its segment's first; None without any."""
         after = bisect_right(self._views, frame.seq, key=lambda view: view.seq)
         for view in self._views[max(after - 1, 0) : after + 1]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,22 +18,10 @@ from recon.posegraph.pieces import apart
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
-from recon.types import F64, Array, DepthMap, Keyframe, Pose, Verdict
+from recon.types import F64, DepthMap, Keyframe, Pose, Verdict
 
 FARTHEST_M = 1e6
 """Maximum distance from the scan's origin."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GraphUpdate:
-    """The answer of the graph once a view is in it; all that tracking needs of it."""
-
-    pose: Pose  # of the view
-    is_placed: bool  # its segment has a similarity to the world
-    is_plausible: bool = True  # its place is not impossibly far away
-    changed: Mapping[int, Pose] = field(default_factory=dict)  # of keyframes published before
-    keyframe: Keyframe | None = None
-    stages: Mapping[str, Array] = field(default_factory=dict)  # of the keyframe; only for debugging
 
 
 class KeyframeMap:
@@ -72,32 +58,32 @@ class KeyframeMap:
         views = 0 if self._loops is None else len(self._loops)
         return {"loop_views": views, "graph_keyframes": len(self.graph)}
 
-    def add(self, view: StereoView, depth: DepthMap | None) -> GraphUpdate:
+    def add(self, view: StereoView, depth: DepthMap | None) -> Pose:
         """Append a view, by vision and by ICP of its depth onto that of the keyframe before, and
-        look for loops."""
+        look for loops; its pose."""
         T_odom, (step, covariance) = view.image.T_odom_camera, self._step(view, depth)
         T_chain = T_odom if step is None else self.trajectory.odom_pose(self._newest) @ step
         up = T_odom[2, :3]
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
-        prior = levelled(view.prior, view.points)
+        prior = levelled(view.frame.prior, view.points)
         self._newest, self._depth = view.seq, depth
-        self._levelled += prior is not view.prior
+        self._levelled += prior is not view.frame.prior
         self.trajectory.add(
-            view.seq, view.segment, T_chain, prior, height, view.time_ns, covariance
+            view.seq, view.segment, T_chain, prior, height, view.frame.time_ns, covariance
         )
         if depth is not None and self._loops is not None:
             with self._timing("loops"):
                 self._loops.look(view.seq, view.segment, view.image.gray, view.image.K, depth)
-        pose = self.trajectory.pose(view.seq)
-        is_plausible = bool(np.abs(pose.T_world_camera[:3, 3]).max() < FARTHEST_M)
-        if depth is not None and is_plausible:
-            self.trajectory.publish(view.seq, pose)
-        elif depth is not None:
+        return self.trajectory.pose(view.seq)
+
+    def publish(self, seq: int, pose: Pose) -> bool:
+        """Whether a keyframe's pose can be given out; not where it is impossibly far away."""
+        if not np.abs(pose.T_world_camera[:3, 3]).max() < FARTHEST_M:
             self._rejected["placed impossibly far away"] += 1
-        is_placed = self.graph.segments[view.segment].similarity is not None
-        changed = self.trajectory.moved() if depth is not None else {}
-        return GraphUpdate(pose, is_placed, is_plausible, changed)
+            return False
+        self.trajectory.publish(seq, pose)
+        return True
 
     def _step(self, view: StereoView, depth: DepthMap | None) -> tuple[F64 | None, F64]:
         """The step (4, 4) from the keyframe before, None where its chain begins, and its covariance
@@ -135,7 +121,7 @@ class KeyframeMap:
     def add_surface(self, view: StereoView, keyframe: Keyframe) -> None:
         """Count the surface of a view that became a keyframe."""
         points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
-        self.graph.segments[view.segment].add_surface(view.seq, points, view.prior)
+        self.graph.segments[view.segment].add_surface(view.seq, points, view.frame.prior)
 
     def apart(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""

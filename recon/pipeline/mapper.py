@@ -20,7 +20,7 @@ from recon.mapping.voxel_map import VoxelMap, ground_sample_m
 from recon.pipeline.config import MapperConfig, Timing, untimed
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import FramePoses
-from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
+from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import (
     DenseStereo,
     Undistort,
@@ -38,15 +38,15 @@ from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.adjusted_track import AdjustedTrack
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
 from recon.types import Array, Camera, Keyframe, PointCloud, Pose, PosePrior
 
 __all__ = ["Mapper", "MapperConfig"]
 
-Reconstructed = GraphUpdate | Keyframe | None
-"""Of a view that is in the graph now, or the first depth of one that comes again; None where that
-shows nothing."""
+Reconstructed = tuple[Pose | None, tuple[Event, ...]]
+"""The pose of a view that is in the graph now, None of one that comes again after its first depth;
+and what there is to tell."""
 
 Reconstruct = Callable[[StereoView], Reconstructed]
 
@@ -181,7 +181,7 @@ class Mapper:
         *late, tracked = self.locate(undistorted)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
         placed = [self._posed(still, self.views.take(still)) for still in late]
         is_view = self.views.take(tracked)  # virtual stereo, 2.3
-        if tracked.relative is not None:
+        if tracked.is_placed:
             for view in self.views.ready():
                 self._worker.offer(view)  # to be reconstructed
             if self._first_stereo is not None and self._worker.is_free:
@@ -192,8 +192,7 @@ class Mapper:
         return (*placed, *done, self._posed(tracked, is_view))
 
     def _posed(self, frame: Frame, is_view: bool) -> FramePosed:
-        plain = replace(frame, image=NO_IMAGE, gray=NO_IMAGE, pyramid=(), features={}, mask=None)
-        return FramePosed(plain, self.frames.place(frame), is_view)
+        return FramePosed(frame.without_images(), self.frames.place(frame), is_view)
 
     def locate(self, frame: Frame) -> list[Frame]:
         """The frame with its pose by the odometry, or why there is none; before it the last one,
@@ -203,7 +202,7 @@ class Mapper:
         self.refused -= Counter(still.reason for still in late)
         if tracked.state is Tracking.WAITING:
             self._waiting[tracked.reason] += 1
-        elif tracked.relative is None:
+        elif not tracked.is_placed:
             self.refused[tracked.reason] += 1
         else:
             if tracked.state is Tracking.STARTED:  # the segment before never began
@@ -211,9 +210,9 @@ class Mapper:
             self._waiting.clear()
         return [*late, tracked]
 
-    def is_settled(self, frame: RelativePose) -> bool:
+    def is_settled(self, frame: Frame) -> bool:
         """True when the odometry no longer adjusts the frame's reference keyframe."""
-        key, window = frame.keyframe, self.odometry.keyframes
+        key, window = frame.reference, self.odometry.keyframes
         if key is None or key.segment != self.odometry.segment or not window:
             return True
         return key.seq < window[0].seq
@@ -221,7 +220,8 @@ class Mapper:
     def reconstruct(self, view: StereoView) -> Reconstructed:
         """One view: its depth from all its partners, its pose, and its new surface."""
         if view.is_first_depth:
-            return self._first_depth(view)
+            first = self._first_depth(view)
+            return None, () if first is None else (KeyframeReady(first, is_first_depth=True),)
         if self.debug is not None:
             self.debug.clear()
         depth, bgr = self.stereo(view)  # virtual stereo pairs, section 2.1; Eq. 1 to 3
@@ -229,20 +229,24 @@ class Mapper:
             segments = self.keyframes.graph.segments
             depth = plausible_depth(view, depth, bgr, segments, self.rejected)
         self.stereo.learn(depth)  # how far the relief of the next pairs may reach
-        update = self.keyframes.add(view, depth)  # ICP onto the keyframe before, pose graph
-        if depth is None or not update.is_plausible:
-            return update
+        pose = self.keyframes.add(view, depth)  # ICP onto the keyframe before, pose graph
+        if depth is None:
+            return pose, ()
+        is_plausible = self.keyframes.publish(view.seq, pose)
+        changed = PosesChanged(self.keyframes.trajectory.moved())
+        if not is_plausible:
+            return pose, (changed,)
         with self._timing("map"):  # what is new
             T_odom = self.keyframes.trajectory.odom_pose(view.seq)
             sigma_m, fresh = self.surface(view.seq, view.segment, depth, view.rows_share, T_odom)
             in_odom = replace(depth, T_world_camera=T_odom)
             bgr = self.exposure(view.segment, in_odom, bgr)  # as bright as the map
-        keyframe = keyframe_of(view, depth, bgr, sigma_m, fresh, update.pose)
+        keyframe = keyframe_of(view, depth, bgr, sigma_m, fresh, pose)
         if self.debug is not None:
             metric = keyframe.depth
             self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
         self.keyframes.add_surface(view, keyframe)
-        return replace(update, keyframe=keyframe, stages=dict(self.debug or {}))
+        return pose, (KeyframeReady(keyframe, stages=dict(self.debug or {})), changed)
 
     def _first_depth(self, view: StereoView) -> Keyframe | None:
         """The new surface that the view's only partner shows, ahead of its whole depth, of which it
@@ -282,21 +286,21 @@ class Mapper:
         return (*events, *self._changed(self.keyframes.trajectory.moved(final=True)))
 
     def _finished(self, everything: bool = False) -> Iterator[Event]:
-        for view, update in self._worker.finished(everything):
-            if not isinstance(update, GraphUpdate):
-                if update is not None:
-                    yield KeyframeReady(update, is_first_depth=True)
-                continue
-            self.frames.add_view(view.relative, update)
-            if update.keyframe is not None:
-                self._ready.add(view.seq)
-                if self._kept is not None:
-                    self._kept[view.seq] = update.keyframe
-                yield KeyframeReady(update.keyframe, stages=update.stages)
-            yield from self._changed(update.changed)
+        for view, (pose, events) in self._worker.finished(everything):
+            if pose is not None:
+                self.frames.add_view(view.frame, pose)
+            for event in events:
+                if isinstance(event, PosesChanged):
+                    yield from self._changed(event.poses)
+                    continue
+                if isinstance(event, KeyframeReady) and not event.is_first_depth:
+                    self._ready.add(view.seq)
+                    if self._kept is not None:
+                        self._kept[view.seq] = event.keyframe
+                yield event
         self.frames.settle()
 
-    def _changed(self, poses: Mapping[int, Pose]) -> Iterator[Event]:
+    def _changed(self, poses: Mapping[int, Pose]) -> Iterator[PosesChanged]:
         # A view whose work was broken off is in the graph, and no keyframe.
         poses = {seq: pose for seq, pose in poses.items() if seq in self._ready}
         if not poses:

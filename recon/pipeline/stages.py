@@ -224,7 +224,7 @@ class DenseStereo:
 def without_false_surface(view: StereoView, depth: DepthMap, bgr: U8) -> DepthMap | None:
     """A view's ``depth``, which has the colours ``bgr``, where its camera can have seen that; None
     with nothing left."""
-    return plausible(drop_edges(depth, bgr), view.prior)
+    return plausible(drop_edges(depth, bgr), view.frame.prior)
 
 
 def plausible_depth(
@@ -249,7 +249,7 @@ def keyframe_of(
     ``depth`` and ``sigma_m`` (h, w) are in units of the odometry.
     """
     metric = replace(depth, sigma_m=sigma_m).scaled(pose.scale, pose.T_world_camera)
-    return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
+    return Keyframe(view.seq, view.frame.time_ns, metric, bgr, pose, fresh)
 
 
 def _resized(image: U8, size_px: tuple[int, int]) -> U8:

@@ -20,10 +20,10 @@ from recon.rolling_shutter import NEAR_S, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.posed_image import PosedImage
 from recon.tracking.adjusted_track import AnyTrack
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.tracking.keyframe_window import landmark_points, median_depth, step_covariance
 from recon.tracking.prediction import inverse_depth_plane
-from recon.types import F32, F64, U8, PosePrior
+from recon.types import F32, F64, U8
 
 KEPT = 6
 """Views remembered as partners; those further back see the ground from too far aside."""
@@ -65,11 +65,9 @@ LAST_VIEW_SHARE = 0.1
 class StereoView:
     """A view with everything that its reconstruction needs, poses as they are known now."""
 
-    time_ns: int
-    prior: PosePrior
+    frame: Frame  # without its images
     image: PosedImage  # in colour
     partners: tuple[PosedImage, ...]
-    relative: RelativePose
     points: F64  # (N, 3) landmarks in the view's camera
     covariance: F64  # (6, 6) of vision's motion from the view before, left, in the view's camera
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
@@ -79,11 +77,11 @@ class StereoView:
 
     @property
     def seq(self) -> int:
-        return self.relative.seq
+        return self.frame.seq
 
     @property
     def segment(self) -> int:
-        return self.relative.segment
+        return self.frame.segment
 
     @property
     def bgr(self) -> U8:
@@ -282,20 +280,20 @@ class VirtualStereoCamera:
         self._segment = odometry.segment
         self._fixes = FixAverage()
         self._waiting = deque[Frame]()
-        self._given: deque[RelativePose] = deque(maxlen=8)
+        self._given: deque[Frame] = deque(maxlen=8)
         self._first = -1  # number of the newest view that was given with its first partner
         self._latest: Frame | None = None  # the last tracked frame, unless it is a view
-        self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
+        self._tracked: deque[Frame] = deque(maxlen=TRACKED)  # without images
 
     def take(self, tracked: Frame) -> bool:
         """Whether the next frame becomes a view."""
         if tracked.segment != self._segment:
             self.end_stretch()
             self._segment = tracked.segment
-        if tracked.T_tracked is None or tracked.relative is None:
+        if tracked.T_tracked is None or not tracked.is_placed:
             return False
         frame = replace(tracked, pyramid=(), features={}, mask=None)
-        self._tracked.append((frame.time_ns, tracked.relative))
+        self._tracked.append(tracked.without_images())
         is_view = self.selection.offer(frame)
         self._fixes.take(tracked.T_tracked, frame.prior)
         if is_view:
@@ -325,7 +323,7 @@ class VirtualStereoCamera:
                 self._refused["blurred"] += 1
             else:
                 found = self._stereo_view(view, self.selection.partners(view))
-                self._given.append(found.relative)
+                self._given.append(found.frame)
                 yield found
 
     def first(self) -> StereoView | None:
@@ -346,19 +344,17 @@ class VirtualStereoCamera:
 
     def _stereo_view(self, view: Frame, partners: list[Frame]) -> StereoView:
         """The view with its image, which is without distortion from now on."""
-        relative, points = view.relative, landmark_points(view.keyframe)
-        assert relative is not None
-        points = se3.transform(se3.inverse(relative.T_keyframe_camera), points)
+        assert view.T_keyframe_camera is not None
+        points = landmark_points(view.keyframe)
+        points = se3.transform(se3.inverse(view.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         # Of the motion since the view given before.
-        since = self._given[-1].keyframe.seq if self._given and self._given[-1].keyframe else -1
+        since = self._given[-1].keyframe.seq if self._given else -1
         keys = [k for k in self._odometry.keyframes if since < k.seq <= view.keyframe.seq]
         return StereoView(
-            view.time_ns,
-            view.prior,
+            view.without_images(),
             replace(self._posed(view, in_odom), bgr=self._undistorter.image(view.image)),
             tuple(self._posed(partner, in_odom) for partner in partners),
-            relative,
             points,
             step_covariance(keys or [view.keyframe], se3.inverse(view.T_odom_camera)),
             {a.seq: a.T_odom_camera for a in self._given if a.segment == view.segment},
@@ -406,11 +402,11 @@ class VirtualStereoCamera:
         if not exposure_s:
             return None
         near = [
-            (t, at) for t, at in self._tracked
-            if abs(t - view.time_ns) < 1e9 * NEAR_S and at.segment == view.segment
+            at for at in self._tracked
+            if abs(at.time_ns - view.time_ns) < 1e9 * NEAR_S and at.segment == view.segment
         ]  # fmt: skip
-        near = [one for one in near if one[0] <= view.time_ns][-2:] + [
-            one for one in near if one[0] > view.time_ns
+        near = [at for at in near if at.time_ns <= view.time_ns][-2:] + [
+            at for at in near if at.time_ns > view.time_ns
         ][:1]
         if len(near) < 2:
             return None
@@ -418,6 +414,7 @@ class VirtualStereoCamera:
         on_axis = se3.transform(view.T_odom_camera, np.array([[0.0, 0.0, depth]]))
         first, last = (
             self._K[0, 0] * on_image(se3.transform(se3.inverse(at.T_odom_camera), on_axis))
-            for _, at in (near[0], near[-1])
+            for at in (near[0], near[-1])
         )
-        return np.asarray((last - first)[0] * exposure_s * 1e9 / (near[-1][0] - near[0][0]))
+        passed_ns = near[-1].time_ns - near[0].time_ns
+        return np.asarray((last - first)[0] * exposure_s * 1e9 / passed_ns)

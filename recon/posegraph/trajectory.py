@@ -113,7 +113,7 @@ class Trajectory:
             covariance = se3.about(-T[:3, 3], covariance)
         if frame is not None and frame.lean is not None:  # nothing in the graph shows it
             covariance = covariance + frame.lean
-        return replace(pose, covariance=covariance)
+        return replace(pose, covariance=covariance, is_aligned=frame is not None)
 
     def places(self, seqs: Sequence[int]) -> F64:
         """(N, 4, 4) T_world_camera of keyframes."""

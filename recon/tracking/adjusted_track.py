@@ -10,7 +10,7 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.focal_watch import FocalWatch
-from recon.tracking.frame import NO_IMAGE, UNKNOWN, Frame, Landmarks, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, UNKNOWN, Frame, Landmarks, Tracking
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
@@ -55,9 +55,9 @@ class AdjustedTrack:
         self.keyframes = [*self.keyframes[1 - KEPT :], key]
         T_odom_camera = still.T_tracked
         assert T_odom_camera is not None, "all stills are placed"
-        relative = RelativePose(seq, 0, se3.inverse(key.T_odom_camera) @ T_odom_camera, key)
         found = replace(
-            frame, state=state, segment=0, T_tracked=T_odom_camera, relative=relative,
+            frame, state=state, segment=0, T_tracked=T_odom_camera,
+            T_keyframe_camera=se3.inverse(key.T_odom_camera) @ T_odom_camera, reference=key,
             tracks=len(still.landmark), row_motion=still.row_motion,
         )  # fmt: skip
         return [found]

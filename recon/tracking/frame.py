@@ -1,9 +1,8 @@
-"""A frame on its way through tracking and stereo, its landmarks, and its pose relative to its
-keyframe."""
+"""A frame on its way through tracking and stereo, and the landmarks that it shows."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -15,6 +14,7 @@ from recon.tracking.sift_features import Features
 from recon.types import F64, I64, U8, Bool, PosePrior
 
 NO_IMAGE: U8 = np.zeros((0, 0), np.uint8)
+NOWHERE, NO_SPREAD = np.full((4, 4), np.nan), np.zeros((6, 6))
 UNKNOWN = PosePrior()
 
 
@@ -81,38 +81,15 @@ class Landmarks:
             self._first += gone
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RelativePose:
-    """A frame's pose relative to a keyframe, whose own pose gets better while it is adjusted.
-
-    Once it no longer changes, :meth:`settled` releases the keyframe, which holds images.
-    """
-
-    seq: int
-    segment: int
-    T_keyframe_camera: F64  # (4, 4); T_odom_camera without a keyframe
-    keyframe: Frame | None = None
-
-    @property
-    def T_odom_camera(self) -> F64:
-        """(4, 4) as known by now."""
-        if self.keyframe is None:
-            return self.T_keyframe_camera
-        return np.asarray(self.keyframe.T_odom_camera @ self.T_keyframe_camera)
-
-    def settled(self) -> RelativePose:
-        """The same with only its current pose in the odometry."""
-        return RelativePose(self.seq, self.segment, self.T_odom_camera)
-
-
 @dataclass(slots=True, eq=False)
 class Frame:
     """One image of the camera, with what is known of it by now.
 
     The caller gives the image, its time and number, and telemetry; :class:`Undistort` the images
     without distortion; the odometry the rest. A frame with a pose may take part in stereo, as a
-    view or as a view's partner. Its pose follows that of the odometry's last keyframe, which is a
-    frame whose corners have landmarks. Images that are no longer needed are :data:`NO_IMAGE`.
+    view or as a view's partner. Its pose follows that of its reference keyframe, the odometry's
+    last one then: a frame whose corners have landmarks, and which is adjusted for a while. Images
+    that are no longer needed are :data:`NO_IMAGE`.
     """
 
     image: U8  # (H, W, 3) BGR with distortion
@@ -127,14 +104,15 @@ class Frame:
     state: Tracking = Tracking.SKIPPED
     segment: int = -1
     T_tracked: F64 | None = None  # (4, 4) T_odom_camera when it was tracked; None: it has no pose
-    relative: RelativePose | None = None  # the same, to the last keyframe
+    T_keyframe_camera: F64 | None = None  # (4, 4) the same, relative to the ``reference``
+    reference: Frame | None = None  # None: once it no longer changes, or without a pose
     tracks: int = 0  # corners found
     reason: str = ""  # why it has no pose
     row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known
     # Of a keyframe, which has no relative pose: its own, refined while it is in the window.
-    T_camera_odom: F64 = field(default_factory=lambda: np.full((4, 4), np.nan))
+    T_camera_odom: F64 = field(default_factory=lambda: NOWHERE)
     # (6, 6) of the motion from the keyframe before, left of T_camera_before.
-    covariance: F64 = field(default_factory=lambda: np.zeros((6, 6)))
+    covariance: F64 = field(default_factory=lambda: NO_SPREAD)
     uv: F64 = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) corners, as their rows saw
     # (N,) the corners' numbers in ``landmarks``, which are of the segment; -1: none yet.
     landmark: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -146,18 +124,31 @@ class Frame:
         return self.pyramid[0]
 
     @property
+    def is_placed(self) -> bool:
+        """True for a frame with a pose in its segment's odometry."""
+        return self.T_keyframe_camera is not None
+
+    @property
     def keyframe(self) -> Frame:
-        assert self.relative is not None, "the frame is not tracked"
-        assert self.relative.keyframe is not None, "a frame of stereo is not settled"
-        return self.relative.keyframe
+        assert self.reference is not None, "a frame of stereo is tracked, and not settled"
+        return self.reference
 
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
-        if self.relative is not None:
-            return self.relative.T_odom_camera
+        T = self.T_keyframe_camera
+        if T is not None:
+            return T if self.reference is None else np.asarray(self.reference.T_odom_camera @ T)
         assert self.T_camera_odom[3, 3] == 1.0, "the frame is not tracked"  # else NaN
         return se3.inverse(self.T_camera_odom)
+
+    def without_images(self) -> Frame:
+        return replace(self, image=NO_IMAGE, gray=NO_IMAGE, pyramid=(), features={}, mask=None)
+
+    def settled(self) -> Frame:
+        """Its present pose in the odometry, and nothing else of it: its keyframe holds images."""
+        T = self.T_odom_camera
+        return Frame(NO_IMAGE, self.time_ns, self.seq, segment=self.segment, T_keyframe_camera=T)
 
     def known_points(self) -> tuple[Bool, F64]:
         """(N,) which corners of a keyframe have a landmark, and (M, 3) those in its camera, in

@@ -19,7 +19,7 @@ from recon import se3
 from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.focal_watch import FocalWatch
-from recon.tracking.frame import NO_IMAGE, Frame, Landmarks, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Landmarks, Tracking
 from recon.tracking.keyframe_window import (
     adjust_window,
     median_depth,
@@ -171,11 +171,9 @@ class Odometry:
     def _found(self, new: Frame, state: Tracking, T_odom_camera: F64, tracks: int = 0) -> Frame:
         """The frame with its pose (4, 4), from now on relative to the newest keyframe."""
         key = self.keyframes[-1]
-        T_keyframe_camera = se3.inverse(key.T_odom_camera) @ T_odom_camera
-        relative = RelativePose(new.seq, key.segment, T_keyframe_camera, key)
         return replace(
-            new, state=state, segment=self.segment, T_tracked=T_odom_camera, relative=relative,
-            tracks=tracks,
+            new, state=state, segment=self.segment, T_tracked=T_odom_camera, tracks=tracks,
+            T_keyframe_camera=se3.inverse(key.T_odom_camera) @ T_odom_camera, reference=key,
         )  # fmt: skip
 
     def _unplaced(self, new: Frame, state: Tracking, reason: str, tracks: int = 0) -> Frame:

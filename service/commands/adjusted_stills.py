@@ -112,8 +112,7 @@ def _tracked(
         check.add(time_ns, tracked)
         if late:
             out[-1] = replace(out[-1], is_tracked=True)
-        is_tracked = tracked.relative is not None
-        out.append(Still(frame.seq, _small(frame), frame.time_ns, is_tracked))
+        out.append(Still(frame.seq, _small(frame), frame.time_ns, tracked.is_placed))
     check.finish()
     return out, check.latency
 

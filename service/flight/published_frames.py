@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.tracking.frame import RelativePose
+from recon.tracking.frame import Frame
 from service.errors import OutsideError
 
 FRAME = np.dtype(
@@ -36,18 +36,16 @@ class PublishedFrames:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._fresh: deque[tuple[RelativePose, Any]] = deque()
+        self._fresh: deque[tuple[Frame, Any]] = deque()
         self._file = tempfile.TemporaryFile(dir=folder, buffering=1 << 16)  # noqa: SIM115
 
-    def add(
-        self, relative: RelativePose, row: Any, is_settled: Callable[[RelativePose], bool]
-    ) -> None:
-        """Take the next frame's row of :data:`FRAME` but for what its ``relative`` knows; those
-        whose keyframes no longer change go to the disk.
+    def add(self, frame: Frame, row: Any, is_settled: Callable[[Frame], bool]) -> None:
+        """Take the next frame's row of :data:`FRAME` but for what the ``frame`` knows; those whose
+        keyframes no longer change go to the disk.
 
         Raises OutsideError when the disk takes no more.
         """
-        self._fresh.append((relative, row))
+        self._fresh.append((frame, row))
         while self._fresh and is_settled(self._fresh[0][0]):
             try:
                 self._file.write(_whole(*self._fresh.popleft()).tobytes())
@@ -67,7 +65,6 @@ class PublishedFrames:
         self._file.close()
 
 
-def _whole(relative: RelativePose, row: Any) -> Any:
-    row["seq"], row["segment"] = relative.seq, relative.segment
-    row["T_odom_camera"] = relative.T_odom_camera
+def _whole(frame: Frame, row: Any) -> Any:
+    row["seq"], row["segment"], row["T_odom_camera"] = frame.seq, frame.segment, frame.T_odom_camera
     return row

@@ -18,7 +18,7 @@ from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import pose_at
 from recon.posegraph.ground_heights import GUESSED_SHARE
 from recon.poses import sigma_m
-from recon.tracking.frame import RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Keyframe, Pose
 from service.cameras.rig import Rig, attitude_of
 from service.flight.pipeline import Pipeline
@@ -88,18 +88,17 @@ class Recorder:
 
     def _write_pose(self, posed: FramePosed, agl_m: float | None) -> None:
         self.states[posed.frame.state] += 1
-        pose = posed.pose
+        pose, frame = posed.pose, posed.frame
         if pose is None:
             return
-        time_ns, relative = posed.frame.time_ns + self._offset_ns, posed.frame.relative
-        if relative is not None:
+        time_ns = frame.time_ns + self._offset_ns
+        if frame.is_placed:
             row = np.zeros((), FRAME)
             row["time_ns"], row["is_view"], row["sigma_m"] = time_ns, posed.is_view, sigma_m(pose)
             row["agl_m"] = np.nan if agl_m is None else agl_m
             row["T_world_camera"] = pose.T_world_camera
-            self._frames.add(relative, row, self.mapper.is_settled)
-        view = relative.seq if posed.is_view and relative is not None else None
-        self.last = self._record(time_ns, pose, agl_m, view)
+            self._frames.add(frame, row, self.mapper.is_settled)
+        self.last = self._record(time_ns, pose, agl_m, frame.seq if posed.is_view else None)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
             self._write_due()
@@ -140,11 +139,14 @@ class Recorder:
         """The poses that corrections have moved, or whose sigma they have changed."""
         for row in self._frames.rows():
             T, before_m, agl_m = row["T_world_camera"], float(row["sigma_m"]), float(row["agl_m"])
-            seq = int(row["seq"])
-            relative = RelativePose(seq, int(row["segment"]), row["T_odom_camera"])
+            time_ns, seq = int(row["time_ns"]), int(row["seq"])
+            frame = Frame(
+                NO_IMAGE, time_ns, seq, segment=int(row["segment"]),
+                T_keyframe_camera=row["T_odom_camera"],
+            )  # fmt: skip
             published = pose_at(T, T[:3, 3], np.full(3, before_m / 3**0.5))
             record = self._record(
-                int(row["time_ns"]), self.mapper.frames.pose(relative, published),
+                time_ns, self.mapper.frames.pose(frame, published),
                 None if math.isnan(agl_m) else agl_m, seq if row["is_view"] else None,
             )  # fmt: skip
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - T[:3, 3])

@@ -47,7 +47,7 @@ class OdometryReport:
     def send(self, posed: FramePosed, state: VehicleState | None) -> None:
         """Hand on the pose of one frame; nothing for a frame without one by vision."""
         pose, frame = posed.pose, posed.frame
-        if pose is None or frame.relative is None:
+        if pose is None or not frame.is_placed:
             return
         position: F64 = np.asarray(R_ENU_NED.T @ pose.T_world_camera[:3, 3])
         R_ned_head = R_ENU_NED.T @ pose.T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T

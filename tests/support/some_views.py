@@ -10,7 +10,7 @@ from recon import se3
 from recon.pipeline.views import StereoView
 from recon.rolling_shutter import FrameRows
 from recon.stereo.posed_image import PosedImage
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose
+from recon.tracking.frame import NO_IMAGE, Frame
 from recon.types import F64, PosePrior
 
 UNKNOWN, NO_MOTIONS = PosePrior(), dict[int, F64]()
@@ -33,9 +33,9 @@ def view_at(
 ) -> StereoView:  # fmt: skip
     """A view at a place of the odometry, of no image unless one is given."""
     blank = PosedImage(None, np.zeros((1, 1), np.uint8), np.eye(3), T_odom_camera, seq=seq)
+    frame = Frame(NO_IMAGE, seq, seq, prior, segment=segment, T_keyframe_camera=T_odom_camera)
     return StereoView(
-        seq, prior, image or blank, tuple(partners),
-        RelativePose(seq, segment, T_odom_camera),
+        frame, image or blank, tuple(partners),
         np.zeros((0, 3)) if points is None else points,
         np.eye(6) if covariance is None else covariance, earlier,
     )  # fmt: skip

@@ -14,23 +14,28 @@ from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.pipeline.config import untimed
 from recon.pipeline.frame_poses import FramePoses, pose_at
-from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
+from recon.pipeline.keyframe_map import KeyframeMap
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import sigma_m
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Pose, PosePrior
 
 RNG = np.random.default_rng(4)
 
 
-def frame_at(seq: int, north_m: float) -> RelativePose:
-    return RelativePose(seq, 3, se3.compose(np.eye(3), np.array([0.0, north_m, 50.0])))
+def relative(seq: int, segment: int, T_keyframe_camera: F64, key: Frame | None = None) -> Frame:
+    return Frame(
+        NO_IMAGE, 0, seq, segment=segment, T_keyframe_camera=T_keyframe_camera, reference=key
+    )
 
 
-def placed(frames: FramePoses, prior: PosePrior, relative: RelativePose) -> Pose:
-    segment = relative.segment
-    pose = frames.place(Frame(NO_IMAGE, 0, relative.seq, prior, segment=segment, relative=relative))
+def frame_at(seq: int, north_m: float) -> Frame:
+    return relative(seq, 3, se3.compose(np.eye(3), np.array([0.0, north_m, 50.0])))
+
+
+def placed(frames: FramePoses, prior: PosePrior, frame: Frame) -> Pose:
+    pose = frames.place(replace(frame, prior=prior))
     assert pose is not None
     return pose
 
@@ -119,23 +124,23 @@ def some_pose() -> F64:
 
 def test_views_keep_their_places_when_they_settle() -> None:
     keys = [keyframe_at(n, some_pose(), n // 50) for n in range(0, 100, 10)]
-    frames = FramePoses(empty(), lambda view: view.keyframe is None or view.keyframe.seq < 70)
-    update = GraphUpdate(Pose(np.eye(4), np.eye(6)), True)
+    frames = FramePoses(empty(), lambda view: view.reference is None or view.reference.seq < 70)
+    pose = Pose(np.eye(4), np.eye(6))
     for key in keys:
-        frames.add_view(RelativePose(key.seq, key.segment, some_pose(), key), update)
-    taken = [RelativePose(n, n // 50, some_pose(), keys[n // 10]) for n in range(100)]
+        frames.add_view(relative(key.seq, key.segment, some_pose(), key), pose)
+    taken = [relative(n, n // 50, some_pose(), keys[n // 10]) for n in range(100)]
     fallback = pose_at(np.eye(4), np.zeros(3), np.ones(3))
     before = [frames.pose(frame, fallback) for frame in taken]
     frames.settle()
     after = [frames.pose(frame, fallback) for frame in taken]
     for one, other in zip(before, after, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera)
-    fixed = [RelativePose(n, n // 50, taken[n].T_odom_camera) for n in (55, 85)]
+    fixed = [relative(n, n // 50, taken[n].T_odom_camera) for n in (55, 85)]
     keys[5].T_camera_odom = keys[8].T_camera_odom = some_pose()
     settled, open_ = (frames.pose(frame, fallback).T_world_camera for frame in fixed)
     np.testing.assert_array_equal(settled, after[55].T_world_camera)
     assert not np.allclose(open_, after[85].T_world_camera)  # its view is still adjusted
-    alone = frames.pose(RelativePose(0, 7, np.eye(4)), fallback)
+    alone = frames.pose(relative(0, 7, np.eye(4)), fallback)
     np.testing.assert_array_equal(alone.T_world_camera[:3, 3], np.zeros(3))
 
 
@@ -144,14 +149,13 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     keyframes: Any = empty()
     frames = FramePoses(keyframes, lambda frame: False)
     key = keyframe_at(3, some_pose())
-    frame, view = (RelativePose(seq, 0, some_pose(), key) for seq in (7, 5))
+    frame, view = (relative(seq, 0, some_pose(), key) for seq in (7, 5))
     assert placed(frames, PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
-    update = keyframes.add(view_at(5, view.T_odom_camera), None)
-    trajectory, known = keyframes.trajectory, keyframes.trajectory.pose(5)
+    known, trajectory = keyframes.add(view_at(5, view.T_odom_camera), None), keyframes.trajectory
     keyframes.trajectory = None
     fallback = pose_at(np.eye(4), np.full(3, 9.0), np.ones(3))
     np.testing.assert_array_equal(frames.pose(frame, fallback).T_world_camera[:3, 3], np.full(3, 9))
-    frames.add_view(view, update)  # the view is done
+    frames.add_view(view, known)  # the view is done
     step = se3.inverse(view.T_odom_camera) @ frame.T_odom_camera
     step[:3, 3] *= known.scale
     found = frames.pose(frame, fallback)
@@ -169,7 +173,7 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     frames = FramePoses(keyframes, lambda frame: False)
     key, fix = keyframe_at(3, np.eye(4)), np.array([20.0, -10.0, 50.0])
     prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
-    view, frame = (RelativePose(seq, 0, some_pose(), key) for seq in (5, 7))
+    view, frame = (relative(seq, 0, some_pose(), key) for seq in (5, 7))
     frames.add_view(view, keyframes.add(view_at(5, view.T_odom_camera, prior=prior), None))
     in_flight = placed(frames, prior, frame)
     keyframes.trajectory.moved(final=True)

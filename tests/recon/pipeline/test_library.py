@@ -17,7 +17,6 @@ from some_views import view_at
 import recon
 from recon import se3
 from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
-from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, Reconstructed, moved
 from recon.pipeline.views import StereoView
 from recon.tracking.frame import Frame, Tracking
@@ -85,7 +84,8 @@ class BrokenOff:
         self.views += 1
         view = view_at(self.views, np.eye(4))
         poses = dict.fromkeys((7, self.views), Pose(np.eye(4), np.eye(6), scale=3.0))
-        return [(view, GraphUpdate(poses[7], True, True, poses, keyframe(self.views)))]
+        ready = KeyframeReady(keyframe(self.views))
+        return [(view, (poses[7], (ready, PosesChanged(poses))))]
 
     is_free = True
 
@@ -147,7 +147,8 @@ class FirstOnly(BrokenOff):
     def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]:
         self.views += 1
         view = view_at(self.views, np.eye(4))
-        return [(replace(view, is_first_depth=True), keyframe(self.views))]
+        first = KeyframeReady(keyframe(self.views), is_first_depth=True)
+        return [(replace(view, is_first_depth=True), (None, (first,)))]
 
 
 def test_a_first_depth_is_said_and_becomes_no_part_of_the_map() -> None:

@@ -109,6 +109,6 @@ def test_a_segment_that_was_refuted_needs_more_views_that_agree() -> None:
     assert stage(second, good) is good
     assert sum(rejected.values()) == 4
     assert not segments[0].is_false and not segments[1].is_false
-    segments[1].add_surface(7, 100, second.prior)
+    segments[1].add_surface(7, 100, second.frame.prior)
     assert stage(second, false) is None and segments[1].is_false
     assert [s.surface for s in segments.false()] == [[7]]  # it was kept before that showed

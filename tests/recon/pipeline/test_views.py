@@ -16,7 +16,7 @@ from recon import se3
 from recon.camera_model import Undistorter
 from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.rolling_shutter import FrameRows, RowClock, Rows
-from recon.tracking.frame import Frame, Landmarks, RelativePose, Tracking
+from recon.tracking.frame import Frame, Landmarks, Tracking
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
@@ -29,10 +29,9 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Fram
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = keyframe_at(seq, T, segment)
     image = np.zeros((32, 32, 3), np.uint8)
-    relative = RelativePose(seq, segment, np.eye(4), key)
     return Frame(
         image, seq, seq, gray=image[..., 0], is_blurred=blurred, segment=segment, T_tracked=T,
-        relative=relative,
+        T_keyframe_camera=np.eye(4), reference=key,
     )  # fmt: skip
 
 
@@ -216,8 +215,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         row_motion = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        relative = RelativePose(i, 0, np.eye(4), keys[-1])
-        views.take(replace(plain, state=state, relative=relative, row_motion=row_motion))
+        views.take(replace(plain, state=state, reference=keys[-1], row_motion=row_motion))
     shares = [view.rows_share for view in views.ready(everything=True)]
     assert len(shares) == 3 and all((share.min() > 0.005) == expected for share in shares)
 
@@ -288,8 +286,7 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
         plain = frame(i, float(i))
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        relative = RelativePose(i, 0, np.eye(4), keys[-1])
-        views.take(replace(plain, time_ns=i * 10**8, state=state, relative=relative))
+        views.take(replace(plain, time_ns=i * 10**8, state=state, reference=keys[-1]))
     blurs = [view.image.blur_px for view in views.ready(everything=True)]
     if not exposure_s:
         assert blurs == [None] * 4

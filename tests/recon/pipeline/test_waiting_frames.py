@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from recon.pipeline.mapper import Mapper
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
 from recon.types import Camera
 
-POSE = cast(RelativePose, object())
+POSE = np.eye(4)
 STARTED, WAITING = (Tracking.STARTED, POSE, ""), (Tracking.WAITING, None, "too little motion")
 KEYFRAME, LOST = (Tracking.KEYFRAME, POSE, ""), (Tracking.LOST, None, "too few matches")
 
@@ -31,7 +31,10 @@ KEYFRAME, LOST = (Tracking.KEYFRAME, POSE, ""), (Tracking.LOST, None, "too few m
 def test_waiting_counts_where_it_is_in_vain(states: list[Any], unused: dict[str, int]) -> None:
     image = Frame(NO_IMAGE, 0, 0, segment=0)
     results = iter(
-        [[replace(image, state=state, relative=at, reason=why)] for state, at, why in states]
+        [
+            [replace(image, state=state, T_keyframe_camera=at, reason=why)]
+            for state, at, why in states
+        ]
     )
     odometry = Mock(Odometry)
     odometry.track.side_effect = results

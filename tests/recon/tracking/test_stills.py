@@ -222,9 +222,7 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
     assert [event.frame.seq for event in posed] == [0, 1, 2, 3, 3, 4, 5]
     lost, late = posed[3:5]
     assert lost.frame.state is Tracking.LOST and late.is_view
-    assert (
-        late.frame.relative is not None and late.frame.relative.seq == 3 and late.pose is not None
-    )
+    assert late.frame.is_placed and late.frame.seq == 3 and late.pose is not None
     np.testing.assert_allclose(late.pose.T_world_camera[:3, 3], track[3][:3, 3], atol=2.0)
     keyframes = [keyframe.seq for keyframe in keyframes_of(events)]
     assert keyframes == list(range(6))

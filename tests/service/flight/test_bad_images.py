@@ -178,7 +178,7 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
         )  # fmt: skip
         *_, posed = pipeline.mapper.track(Frame(image, i * 40_000_000, i, rig.prior(sensed, None)))
         if isinstance(posed, FramePosed) and posed.pose is not None:
-            kept = seen if posed.frame.relative is not None else lost
+            kept = seen if posed.frame.is_placed else lost
             kept.append((i, posed.pose.T_world_camera[:3, 3]))
     pipeline.mapper.finish()
     assert len(seen) > 30 and len(lost) > 8

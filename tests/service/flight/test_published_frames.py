@@ -12,7 +12,7 @@ import pytest
 from some_views import keyframe_at
 
 from recon import se3
-from recon.tracking.frame import RelativePose
+from recon.tracking.frame import NO_IMAGE, Frame
 from recon.types import F64
 from service.errors import OutsideError
 from service.flight.published_frames import FRAME, PublishedFrames
@@ -27,44 +27,46 @@ def some_pose() -> F64:
 def before(limit: int) -> Any:
     """Keyframes before ``limit`` no longer change."""
 
-    def is_settled(frame: RelativePose) -> bool:
-        return frame.keyframe is None or frame.keyframe.seq < limit
+    def is_settled(frame: Frame) -> bool:
+        return frame.keyframe.seq < limit
 
     return is_settled
 
 
-def published(seq: int, key: Any, agl_m: float = 41.5) -> tuple[RelativePose, Any]:
+def published(seq: int, key: Any, agl_m: float = 41.5) -> tuple[Frame, Any]:
     row = np.zeros((), FRAME)
     row["time_ns"], row["T_world_camera"] = 10**18 + seq, some_pose()
     row["sigma_m"], row["agl_m"], row["is_view"] = 0.5 + seq, agl_m, seq % 2 == 0
-    return RelativePose(seq, key.segment, some_pose(), key), row
+    frame = Frame(NO_IMAGE, 0, seq, segment=key.segment, reference=key)
+    frame.T_keyframe_camera = some_pose()
+    return frame, row
 
 
 def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
     keys = [keyframe_at(n, some_pose(), n // 20) for n in range(0, 40, 10)]
     frames = [published(seq, keys[seq // 10], np.nan if seq == 3 else 41.5) for seq in range(40)]
     kept = PublishedFrames(tmp_path)
-    for frame in frames:
-        kept.add(*frame, before(20))
+    for one in frames:
+        kept.add(*one, before(20))
     keys[2].T_camera_odom = some_pose()  # still in the window: the newest pose counts
     found = list(kept.rows())
     assert not list(tmp_path.iterdir())  # no name: nothing is left behind
-    for (relative, one), other in zip(frames, found, strict=True):
+    for (frame, one), other in zip(frames, found, strict=True):
         for name in ("time_ns", "is_view", "sigma_m", "T_world_camera"):
             assert np.array_equal(one[name], other[name])
         assert np.array_equal(one["agl_m"], other["agl_m"], equal_nan=True)
-        assert np.array_equal(relative.T_odom_camera, other["T_odom_camera"])
-        assert (relative.seq, relative.segment) == (other["seq"], other["segment"])
+        assert np.array_equal(frame.T_odom_camera, other["T_odom_camera"])
+        assert (frame.seq, frame.segment) == (other["seq"], other["segment"])
     kept.close()
 
 
 def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
     kept, places = PublishedFrames(tmp_path), []
     for seq in range(500):
-        relative, row = published(seq, keyframe_at(seq, some_pose()))
-        kept.add(relative, row, before(seq - 9))
+        frame, row = published(seq, keyframe_at(seq, some_pose()))
+        kept.add(frame, row, before(seq - 9))
         places.append(weakref.ref(row))
-        del relative, row
+        del frame, row
     assert sum(place() is not None for place in places) <= 11
     assert len(list(kept.rows())) == 500
     kept.close()

@@ -22,7 +22,7 @@ from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
 from recon.poses import sigma_m
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
 from service.cameras.source import CameraFrame
@@ -43,9 +43,8 @@ def pose(seq: int, of_m: float) -> Pose:
 
 
 def posed(seq: int, of_m: float = 0.1) -> FramePosed:
-    relative = RelativePose(seq, 0, np.eye(4))
-    frame = Frame(NO_IMAGE, 1_000_000 * seq, seq, state=Tracking.TRACKED, relative=relative)
-    return FramePosed(frame, pose(seq, of_m))
+    frame = Frame(NO_IMAGE, 1_000_000 * seq, seq, segment=0, state=Tracking.TRACKED)
+    return FramePosed(replace(frame, T_keyframe_camera=np.eye(4)), pose(seq, of_m))
 
 
 def lost(seq: int) -> FramePosed:
@@ -68,7 +67,7 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
     0: that of a frame as it was published.
     """
 
-    def at(frame: RelativePose, published: Pose) -> Pose:
+    def at(frame: Frame, published: Pose) -> Pose:
         there = pose(frame.seq, 1.0).T_world_camera[:3, 3]
         assert np.linalg.norm(published.T_world_camera[:3, 3] - there) == 0
         return pose(frame.seq, of_m or sigma_m(published))

@@ -22,7 +22,7 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.pipeline.events import FramePosed
-from recon.tracking.frame import NO_IMAGE, Frame, RelativePose, Tracking
+from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Camera, Pose
 from service.config import CameraConfig, load_config
 from service.daemon.runtime import Daemon
@@ -45,7 +45,7 @@ def posed_at(
     T = se3.compose(R, np.array(enu))
     frame = Frame(
         NO_IMAGE, time_ns, 0, state=Tracking.TRACKED, segment=segment,
-        relative=RelativePose(0, segment, T), tracks=150,
+        T_keyframe_camera=T, tracks=150,
     )  # fmt: skip
     pose = Pose(T, se3.about(-T[:3, 3], COVARIANCE), ("vision",))
     return FramePosed(frame, pose)
