@@ -11,6 +11,8 @@ doi:10.1093/biomet/73.1.13), as errors of neighbouring landmarks are alike.
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from recon.tracking.bundle import BundleResult, linearise_all
 from recon.types import F64, I64
@@ -90,29 +92,18 @@ def _not_taken_up(
 
     ``by_pose`` (M, 2, 6) and ``by_point`` (M, 2, 3) are the derivatives.
     """
-    H = np.zeros((N, 3, 3))
-    np.add.at(H, point, np.einsum("mki,mkj->mij", by_point, by_point))
-    ridge = 1e-9 * np.trace(H, axis1=1, axis2=2) + 1e-9  # far points have no depth
-    H_inv = np.linalg.inv(H + ridge[:, None, None] * np.eye(3))
-    W = np.zeros((C, N, 6, 3))
-    np.add.at(W, (cam, point), np.einsum("mki,mkj->mij", by_pose, by_point))
-    of_pose = np.zeros((C, 6, 6))
-    np.add.at(of_pose, cam, np.einsum("mki,mkj->mij", by_pose, by_pose))
-    S = np.zeros((C, 6, C, 6))
-    S[np.arange(C), :, np.arange(C)] = of_pose
-    wide = W.transpose(0, 2, 1, 3).reshape(6 * C, 3 * N)
-    eliminated = np.einsum("cnij,njk->cnik", W, H_inv).transpose(0, 2, 1, 3).reshape(6 * C, 3 * N)
-    V = values.shape[2]
-    of_points, of_poses = np.zeros((N, 3, V)), np.zeros((C, 6, V))
-    np.add.at(of_points, point, np.einsum("mki,mkv->miv", by_point, values))
-    np.add.at(of_poses, cam, np.einsum("mki,mkv->miv", by_pose, values))
-    reduced = S.reshape(6 * C, 6 * C) - eliminated @ wide.T
-    inverse = np.linalg.pinv(reduced, rcond=1e-9, hermitian=True)  # place, turn and scale are open
-    rows_of_points, rows_of_poses = of_points.reshape(3 * N, V), of_poses.reshape(6 * C, V)
-    poses = inverse @ (rows_of_poses - eliminated @ rows_of_points)
-    points = H_inv @ (rows_of_points - wide.T @ poses).reshape(N, 3, V)
-    taken = by_pose @ poses.reshape(C, 6, V)[cam]
-    return np.asarray(values - taken - by_point @ points[point])
+    unknowns = np.hstack(
+        [6 * cam[:, None] + np.arange(6), 6 * C + 3 * point[:, None] + np.arange(3)]
+    )
+    columns, flat = np.repeat(unknowns, 2, axis=0), values.reshape(-1, values.shape[2])
+    entries, starts = np.concatenate([by_pose, by_point], axis=2), np.arange(len(columns) + 1) * 9
+    shape = len(columns), 6 * C + 3 * N
+    J = sparse.csr_matrix((entries.ravel(), columns.ravel(), starts), shape)
+    H = (J.T @ J).tocsc()
+    # Place, turn and scale are open, and so are the depths of far points.
+    H += sparse.diags_array(1e-9 * H.diagonal() + 1e-12)
+    taken = J @ splu(H, permc_spec="MMD_AT_PLUS_A").solve(J.T @ flat)
+    return np.asarray(values - taken.reshape(values.shape))
 
 
 def _cells(at: F64, point: I64, N: int) -> I64:
