@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.ground_heights import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
-from recon.posegraph.pose_priors import MIN_FIX_M, has_fix
+from recon.posegraph.pose_priors import MIN_FIX_M, has_fix, off_attitudes
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S, Noise, bias_time_constant_s, inflation
 from recon.similarity import Similarity
@@ -336,12 +336,9 @@ class AlignmentReadings:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         seen, R_prior = at.R @ self.R_odom, self.R_prior.copy()
         R_prior[self.is_assumed] = R_prior[self.is_assumed] @ se3.so3_exp(at.mount_rad)
-        turn = se3.each_so3_log(seen @ R_prior.transpose(0, 2, 1))
-        up = np.einsum("nij,nj->ni", seen, R_prior[:, 2])  # where the prior's up points now
-        tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(n)])
         of_up = (seen @ se3.hat(R_prior[:, 2])) * self.is_assumed[:, None, None]
         of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
-        return np.where(self.heading_known[:, None], turn, tilt), of_mount
+        return off_attitudes(seen, R_prior, self.heading_known), of_mount
 
 
 def from_middle(time_s: float | F64, middle_s: float, half_s: float) -> F64:

@@ -15,7 +15,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import height_ratio
-from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix
+from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_attitudes
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
@@ -327,10 +327,7 @@ class GraphFactors:
 
 def _turn(R: F64, R_measured: F64, heading: bool) -> F64:
     """(3,) world rotation from ``R`` to the measured attitude; without ``heading``, its tilt."""
-    if heading:
-        return se3.so3_log(R_measured @ R.T)
-    up = R @ R_measured[2]  # where the reading's up points now
-    return np.array([up[1], -up[0], 0.0])
+    return np.asarray(-off_attitudes(R[None], R_measured[None], np.array([heading]))[0])
 
 
 def _length_sigma(node: Node, last: Node) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.records import Node
-from recon.types import F64, PosePrior, Travel
+from recon.types import F64, Bool, PosePrior, Travel
 
 MIN_FIX_M = 0.005
 """Sigma that no fix is better than."""
@@ -66,6 +66,15 @@ def is_frozen(prior: PosePrior, before: PosePrior) -> bool:
     if prior.position_m is None or before.position_m is None:
         return False
     return float(np.abs(before.position_m - prior.position_m).max()) <= 1e-6
+
+
+def off_attitudes(seen: F64, measured: F64, has_heading: Bool) -> F64:
+    """(N, 3) rotations in the world from attitudes (N, 3, 3) to those seen (N, 3, 3); of one
+    without a heading, the tilt alone."""
+    turn = se3.each_so3_log(seen @ measured.transpose(0, 2, 1))
+    up = np.einsum("nij,nj->ni", seen, measured[:, 2])  # where the attitude's up points now
+    tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(len(up))])
+    return np.where(has_heading[:, None], turn, tilt)
 
 
 @dataclass(slots=True, eq=False)

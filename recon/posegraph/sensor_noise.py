@@ -244,24 +244,9 @@ def drift_noise(times_s: F64, residuals: F64) -> tuple[float, float] | None:
     lag, change = variogram(times_s, residuals)
     if len(lag) < 3:
         return None
-    weight = np.sqrt(lag[-1] / lag) / np.maximum(change, 1e-12 + 0.01 * change.max())
-    columns = np.column_stack([lag, lag**2])
-    parts, _ = nonnegative(columns * weight[:, None], change * weight)
-    return float(np.sqrt(parts[0])), float(np.sqrt(parts[1]))
-
-
-def nonnegative(columns: F64, wanted: F64) -> tuple[F64, float]:
-    """The factors (C,), none below 0, of at most two ``columns`` (N, C) that sum up best to
-    ``wanted`` (N,), and the length of the rest."""
-    count = columns.shape[1]
-    best, least = np.zeros(count), float(np.linalg.norm(wanted))
-    for used in ([0], [1], [0, 1])[: 1 if count == 1 else 3]:
-        parts = np.zeros(count)
-        parts[used] = np.linalg.lstsq(columns[:, used], wanted, rcond=None)[0]
-        rest = float(np.linalg.norm(columns @ parts - wanted))
-        if parts.min() >= 0 and rest < least:
-            best, least = parts, rest
-    return best, least
+    parts, _ = _fit_variogram(lag, change, lag, lag**2)
+    walk, rate = np.sqrt(np.maximum(parts, 0.0))
+    return float(walk), float(rate)
 
 
 def variogram(times_s: F64, residuals: F64) -> tuple[F64, F64]:

@@ -11,7 +11,6 @@ import pytest
 from flown_track import node
 from paths import ROOT
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import nnls
 from scipy.stats import chi2
 
 from recon import se3
@@ -24,7 +23,6 @@ from recon.posegraph.sensor_noise import (
     bias_time_constant_s,
     drift_noise,
     gauss_markov_noise,
-    nonnegative,
 )
 from recon.types import F64, PosePrior, Travel
 
@@ -276,17 +274,6 @@ def test_velocity_is_integrated_until_a_gap() -> None:
     assert after is not None and after.run != steps[1].run and after.seconds == 0.0
     back = integrator.add(19 * 10**9, faster).travel
     assert back is not None and back.run != after.run
-
-
-@pytest.mark.parametrize("columns", [1, 2])
-def test_factors_that_are_not_negative_agree_with_scipy(columns: int) -> None:
-    rng = np.random.default_rng(columns)
-    for _ in range(100):
-        A, b = rng.uniform(0, 1, (12, columns)), rng.normal(0.3, 1.0, 12)
-        expected, rest = nnls(A, b)
-        found, length = nonnegative(A, b)
-        np.testing.assert_allclose(found, expected, atol=1e-9)
-        assert length == pytest.approx(rest)
 
 
 def test_medians_of_chi_squared_agree_with_scipy() -> None:
