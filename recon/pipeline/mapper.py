@@ -313,8 +313,7 @@ class Mapper:
 
     def set_spacing(self, metres: float, frames: int) -> None:
         """Space views otherwise from the next frame on, as :class:`MapperConfig` says."""
-        selection = self.views.selection
-        selection.spacing_m, selection.spacing_frames = metres, frames
+        self.views.selection.spacing = metres, frames
         self.stereo.set_min_base_to_height(self.views.selection.min_base_to_height)
 
     def set_effort(self, pairs: int, stereo_width_px: int, upsample: bool) -> None:

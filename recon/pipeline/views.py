@@ -108,7 +108,7 @@ class ViewSelection:
         With more partners than the neighbouring views can be, tracked frames between them
         become partners too.
         """
-        self.spacing_m, self.spacing_frames = spacing_m, spacing_frames
+        self.spacing = spacing_m, spacing_frames  # set at once: a frame may come at any time
         self.max_partners = partners
         self.takes_next = False  # the next frame with a pose, whatever the baseline asks for
         self._all_known = all_known
@@ -121,7 +121,7 @@ class ViewSelection:
 
     @property
     def _is_auto(self) -> bool:
-        return not (self.spacing_m or self.spacing_frames)
+        return not any(self.spacing)
 
     @property
     def frames_per_step(self) -> float:
@@ -197,12 +197,12 @@ class ViewSelection:
     def _wants(self, frame: Frame) -> bool:
         if frame.state is Tracking.STARTED or not self._kept:
             return frame.state in (Tracking.STARTED, Tracking.KEYFRAME)
-        last = self._kept[-1]
-        if self._is_auto or last.segment != frame.segment:
+        last, (metres, frames) = self._kept[-1], self.spacing
+        if not (metres or frames) or last.segment != frame.segment:
             return frame.state is Tracking.KEYFRAME
-        if self.spacing_frames:
-            return frame.seq - last.seq >= self.spacing_frames
-        return _apart(frame, last) >= self.spacing_m
+        if frames:
+            return frame.seq - last.seq >= frames
+        return _apart(frame, last) >= metres
 
     def ready(self, view: Frame) -> bool:
         """True when the view has two neighbours to pair with, or its segment is over."""

@@ -17,8 +17,8 @@ from some_views import view_at
 import recon
 from recon import se3
 from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
-from recon.pipeline.mapper import Mapper, Reconstructed, moved
-from recon.pipeline.views import StereoView
+from recon.pipeline.mapper import Mapper, MapperConfig, Reconstructed, moved
+from recon.pipeline.views import StereoView, ViewSelection
 from recon.tracking.frame import Frame, Tracking
 from recon.types import Camera, DepthMap, Keyframe, Pose, PosePrior
 
@@ -70,6 +70,21 @@ def test_a_mapper_without_its_keyframes_has_no_cloud() -> None:
     with pytest.raises(ValueError, match="keeps_cloud"):
         mapper.cloud()
     assert mapper.finish() == () and len(Mapper(CAMERA).finish()) == 0
+
+
+def test_no_frame_comes_between_the_two_numbers_of_a_spacing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another thread sets them: every fifth frame follows every two metres."""
+    mapper, are_auto = Mapper(CAMERA, MapperConfig(spacing_m=2.0)), list[bool]()
+
+    def watched(one: ViewSelection, name: str, value: object) -> None:
+        object.__setattr__(one, name, value)
+        are_auto.append(one._is_auto)
+
+    monkeypatch.setattr(ViewSelection, "__setattr__", watched)
+    mapper.set_spacing(0.0, 5)
+    assert are_auto == [False]
 
 
 class BrokenOff:

@@ -134,7 +134,7 @@ def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
     views = ViewSelection(spacing_m=2.0)
     taken = [i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")]
     assert taken == [0, 4, 8, 12, 16]
-    views.spacing_m = 1.0
+    views.spacing = 1.0, 0
     more = [i for i in range(20, 26) if offer(views, i, 0.5 * i, "tracked")]
     assert more == [20, 22, 24]
 
