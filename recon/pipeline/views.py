@@ -290,12 +290,12 @@ class VirtualStereoCamera:
         if tracked.segment != self._segment:
             self.end_stretch()
             self._segment = tracked.segment
-        if tracked.T_tracked is None or not tracked.is_placed:
+        if not tracked.is_placed:
             return False
         frame = replace(tracked, pyramid=(), features={}, mask=None)
         self._tracked.append(tracked.without_images())
         is_view = self.selection.offer(frame)
-        self._fixes.take(tracked.T_tracked, frame.prior)
+        self._fixes.take(frame.T_odom_camera, frame.prior)
         if is_view:
             self._wait(frame)
         self._latest = None if is_view else frame

@@ -53,11 +53,8 @@ class AdjustedTrack:
         self.segment = 0
         key = replace(still, time_ns=frame.time_ns, prior=frame.prior)
         self.keyframes = [*self.keyframes[1 - KEPT :], key]
-        T_odom_camera = still.T_tracked
-        assert T_odom_camera is not None, "all stills are placed"
         found = replace(
-            frame, state=state, segment=0, T_tracked=T_odom_camera,
-            T_keyframe_camera=se3.inverse(key.T_odom_camera) @ T_odom_camera, reference=key,
+            frame, state=state, segment=0, T_keyframe_camera=np.eye(4), reference=key,
             tracks=len(still.landmark), row_motion=still.row_motion,
         )  # fmt: skip
         return [found]
@@ -75,7 +72,7 @@ def adjusted_still(
     T_camera_odom = se3.inverse(T_odom_camera)
     row_motion = FrameRows(0, UNKNOWN, T_camera_odom, rows, is_measured=True)
     return Frame(
-        NO_IMAGE, 0, seq, segment=0, T_tracked=T_odom_camera, T_camera_odom=T_camera_odom,
+        NO_IMAGE, 0, seq, segment=0, T_camera_odom=T_camera_odom,
         covariance=covariance, uv=np.zeros((len(landmark), 2)), landmark=landmark,
         landmarks=landmarks, row_motion=row_motion,
     )  # fmt: skip

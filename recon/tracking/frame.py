@@ -36,22 +36,12 @@ class Landmarks:
     def __init__(self) -> None:
         self._xyz = np.zeros((0, 3))
         self._first = 0
-        self._end = 0
-
-    def __len__(self) -> int:
-        return self._end - self._first
 
     def add(self, points: F64) -> I64:
         """Enter points (N, 3); returns their (N,) numbers."""
-        need = len(self) + len(points)
-        if need > len(self._xyz):
-            grown = np.full((2 * need, 3), np.nan)
-            grown[: len(self)] = self._xyz[: len(self)]
-            self._xyz = grown
-        self._xyz[len(self) : need] = points
-        numbers = np.arange(self._end, self._end + len(points), dtype=np.int64)
-        self._end += len(points)
-        return numbers
+        end = self._first + len(self._xyz)
+        self._xyz = np.vstack([self._xyz, points])
+        return np.arange(end, end + len(points), dtype=np.int64)
 
     def __getitem__(self, numbers: I64) -> F64:
         """(N, 3) points of the (N,) numbers."""
@@ -73,12 +63,9 @@ class Landmarks:
 
     def forget_before(self, number: int) -> None:
         """Free all points with smaller numbers."""
-        gone = min(number, self._end) - self._first
-        if gone > 0:
-            kept = self._xyz[gone : len(self)].copy()
-            self._xyz[: len(kept)] = kept
-            self._xyz[len(kept) :] = np.nan
-            self._first += gone
+        gone = min(max(number - self._first, 0), len(self._xyz))
+        self._xyz = self._xyz[gone:].copy()
+        self._first += gone
 
 
 @dataclass(slots=True, eq=False)
@@ -103,8 +90,7 @@ class Frame:
     is_blurred: bool = False  # takes no part in stereo, only in the track
     state: Tracking = Tracking.SKIPPED
     segment: int = -1
-    T_tracked: F64 | None = None  # (4, 4) T_odom_camera when it was tracked; None: it has no pose
-    T_keyframe_camera: F64 | None = None  # (4, 4) the same, relative to the ``reference``
+    T_keyframe_camera: F64 | None = None  # (4, 4) relative to the ``reference``, else T_odom_camera
     reference: Frame | None = None  # None: once it no longer changes, or without a pose
     tracks: int = 0  # corners found
     reason: str = ""  # why it has no pose

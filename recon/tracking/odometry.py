@@ -172,8 +172,8 @@ class Odometry:
         """The frame with its pose (4, 4), from now on relative to the newest keyframe."""
         key = self.keyframes[-1]
         return replace(
-            new, state=state, segment=self.segment, T_tracked=T_odom_camera, tracks=tracks,
-            T_keyframe_camera=se3.inverse(key.T_odom_camera) @ T_odom_camera, reference=key,
+            new, state=state, segment=self.segment, tracks=tracks, reference=key,
+            T_keyframe_camera=se3.inverse(key.T_odom_camera) @ T_odom_camera,
         )  # fmt: skip
 
     def _unplaced(self, new: Frame, state: Tracking, reason: str, tracks: int = 0) -> Frame:

@@ -104,9 +104,9 @@ class TelemetryCheck:
         """Add a frame's pose by vision, at its stamp; evaluate all of them now and then."""
         if self._history is None or frame.state is Tracking.SKIPPED:
             return
-        T = frame.T_tracked
         last, self._last = self._last, None
-        if T is not None:
+        if frame.is_placed:
+            T = frame.T_odom_camera
             self._last = (stamp_ns, frame.segment, T[:3, :3].copy())
             if last is not None and last[1] == frame.segment:
                 self._turn(last[0], stamp_ns, last[2].T @ T[:3, :3])

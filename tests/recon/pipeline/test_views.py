@@ -30,7 +30,7 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Fram
     key = keyframe_at(seq, T, segment)
     image = np.zeros((32, 32, 3), np.uint8)
     return Frame(
-        image, seq, seq, gray=image[..., 0], is_blurred=blurred, segment=segment, T_tracked=T,
+        image, seq, seq, gray=image[..., 0], is_blurred=blurred, segment=segment,
         T_keyframe_camera=np.eye(4), reference=key,
     )  # fmt: skip
 

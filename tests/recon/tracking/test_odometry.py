@@ -79,9 +79,7 @@ def fly(
 def drift(track: list[F64], found: list[Frame]) -> float:
     """RMS distance after the best similarity, in metres."""
     pairs = [
-        (f.T_tracked[:3, 3], T[:3, 3])
-        for f, T in zip(found, track, strict=True)
-        if f.T_tracked is not None
+        (f.T_odom_camera[:3, 3], T[:3, 3]) for f, T in zip(found, track, strict=True) if f.is_placed
     ]
     a, b = (np.array(x) for x in zip(*pairs, strict=True))
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)

@@ -52,9 +52,7 @@ def flown(
 def off_m(track: list[F64], found: list[Frame]) -> float:
     """RMS distance of the places after the best similarity."""
     pairs = [
-        (f.T_tracked[:3, 3], T[:3, 3])
-        for f, T in zip(found, track, strict=True)
-        if f.T_tracked is not None
+        (f.T_odom_camera[:3, 3], T[:3, 3]) for f, T in zip(found, track, strict=True) if f.is_placed
     ]
     a, b = (np.array(x) for x in zip(*pairs, strict=True))
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)

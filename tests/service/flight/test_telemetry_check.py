@@ -25,7 +25,7 @@ LATE_S = 0.07
 
 
 def seen(state: Tracking, T_odom_camera: F64 | None = None, segment: int = 0) -> Frame:
-    return Frame(NO_IMAGE, 0, 0, state=state, segment=segment, T_tracked=T_odom_camera)
+    return Frame(NO_IMAGE, 0, 0, state=state, segment=segment, T_keyframe_camera=T_odom_camera)
 
 
 def body(t: float, strength: float = 1.0) -> Rotation:
