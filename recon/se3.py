@@ -154,6 +154,19 @@ def adjoint(T: F64) -> F64:
     return out
 
 
+def left_covariance(T: F64, covariance: F64) -> F64:
+    """(6, 6) covariance of the left perturbation of ``T`` from that of the right: one in b's frame
+    as one in a's, for T_a_b."""
+    A = adjoint(T)
+    return np.asarray(A @ covariance @ A.T)
+
+
+def in_units(covariance: F64, unit: float) -> F64:
+    """(6, 6) covariance of a motion whose lengths are multiplied by ``unit``."""
+    factor = np.array([1.0] * 3 + [unit] * 3)
+    return np.asarray(covariance * np.outer(factor, factor))
+
+
 def about(place: F64, covariance: F64) -> F64:
     """(6, 6) covariance of a perturbation about the (3,) place, from one about the origin.
 

@@ -98,8 +98,7 @@ class KeyframeMap:
         if T_before is None:
             return None, covariance
         step = se3.inverse(T_before) @ view.image.T_odom_camera
-        A = se3.adjoint(step)
-        covariance = A @ covariance @ A.T
+        covariance = se3.left_covariance(step, covariance)
         if depth is None or self._depth is None:
             return step, covariance
         with self._timing("icp"):

@@ -19,7 +19,7 @@ from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_a
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
-from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
+from recon.posegraph.smoother import NO_SCALE, Smoother
 from recon.types import F64, PosePrior
 
 HEIGHT_GATE = 0.05
@@ -109,7 +109,7 @@ class GraphFactors:
             used = {"vision" if is_seen else "dead reckoning"}
             T = se3.project_to_so3(T_last @ motion)
             path_m = self.path_m[-1] + float(np.linalg.norm(motion[:3, 3]))
-            spread = spread_last + left_covariance(T_last, covariance)
+            spread = spread_last + se3.left_covariance(T_last, covariance)
         self.smoother.append_pose(T, spread)
         self.path_m.append(path_m)
         node = replace(node, prior=self._prior)
@@ -151,7 +151,7 @@ class GraphFactors:
         sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
         self.smoother.add_turn("prior", node.key, T[:3, :3], sigma[:3])
         self.smoother.add_place("prior place", node.key, T[:3, 3], sigma[3:])
-        return T, left_covariance(T, np.diag(sigma**2))
+        return T, se3.left_covariance(T, np.diag(sigma**2))
 
     def _motion(
         self, node: Node, last: Node, T_last: F64, before: PosePrior
@@ -212,8 +212,7 @@ class GraphFactors:
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
         frame = self._segments[node.segment].frame
         motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
-        units = np.array([1.0] * 3 + [frame.scale] * 3)
-        covariance = node.covariance * np.outer(units, units) + np.diag([1e-10] * 3 + [1e-6] * 3)
+        covariance = se3.in_units(node.covariance, frame.scale) + np.diag([1e-10] * 3 + [1e-6] * 3)
         covariance[3:, 3:] += SIGMA_STEP**2 * np.outer(motion[:3, 3], motion[:3, 3])
         return motion, covariance
 
@@ -237,7 +236,7 @@ class GraphFactors:
         motion = se3.inverse(T_last) @ T
         # Translation and rotation are separate: an error of one does not rotate the other.
         apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
-        return motion, left_covariance(motion, apart)
+        return motion, se3.left_covariance(motion, apart)
 
     def _velocity(self, last: Node, T_last: F64) -> F64 | None:
         """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where

@@ -23,7 +23,6 @@ from recon.posegraph.smoother import (
     Smoother,
     State,
     columns_of,
-    left_covariance,
     scale_columns,
 )
 from recon.table import Rows
@@ -298,7 +297,7 @@ def _step(track: KeyframeTrack, key: int) -> tuple[str, F64, F64]:
     if pause > BREAK_S:
         turn, shift, kind = SIGMA_BREAK_RAD, SIGMA_BREAK_M * pause / BREAK_S, "link"
     right = np.diag([turn**2] * 3 + [shift**2] * 3)
-    return kind, motion, left_covariance(motion, right)
+    return kind, motion, se3.left_covariance(motion, right)
 
 
 def _add_placing(smoother: Smoother, track: KeyframeTrack) -> None:

@@ -123,8 +123,7 @@ def verify(a: LoopEnd, b: LoopEnd, T_a_b_guess: F64) -> LoopClosure | None:
         solved = pnp.solve(points[found.ok], seen, b.K, prior, min_inliers=MIN_INLIERS)
         if solved is not None and solved.inlier_share >= MIN_INLIER_SHARE:
             T_a_b = se3.inverse(solved.T_camera_points)
-            A = se3.adjoint(T_a_b)
-            return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T)
+            return _with_icp(a, b, T_a_b, se3.left_covariance(T_a_b, solved.covariance))
     return None
 
 

@@ -63,10 +63,9 @@ class Loop:
 
     def scaled(self, factor: float) -> Loop:
         """The same with lengths multiplied by ``factor``."""
-        units = np.array([1.0] * 3 + [factor] * 3)
         T = self.T_a_b.copy()
         T[:3, 3] *= factor
-        return replace(self, T_a_b=T, covariance=self.covariance * np.outer(units, units))
+        return replace(self, T_a_b=T, covariance=se3.in_units(self.covariance, factor))
 
 
 LOOP_WINDOW = 15
@@ -84,8 +83,7 @@ def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64) -> bool:
     """
     circle = T_a_a @ other.T_a_b @ T_b_b @ se3.inverse(one.T_a_b)
     length = float(np.linalg.norm(T_a_a[:3, 3]) + np.linalg.norm(T_b_b[:3, 3]))
-    A = se3.adjoint(T_a_a)
     slack = np.diag([0.01**2] * 3 + [(0.03 * length + 0.02) ** 2] * 3)
-    covariance = one.covariance + A @ other.covariance @ A.T + slack
+    covariance = one.covariance + se3.left_covariance(T_a_a, other.covariance) + slack
     error = se3.log(circle)
     return bool(error @ np.linalg.solve(covariance, error) < CHI2_LIMIT)

@@ -329,13 +329,7 @@ class Smoother:
         return {kind: one.about(self._held.at)[0] for kind, one in self.factors.items()}
 
 
-def left_covariance(T: F64, covariance: F64) -> F64:
-    """(6, 6) covariance of the left perturbation of ``T`` from that of the right."""
-    A = se3.adjoint(T)
-    return np.asarray(A @ covariance @ A.T)
-
-
 def reversed_motion(T: F64, covariance: F64) -> tuple[F64, F64]:
     """T_b_a and its (6, 6) covariance in b's frame, from T_a_b and that in a's frame."""
     back = se3.inverse(T)
-    return back, left_covariance(back, covariance)
+    return back, se3.left_covariance(back, covariance)

@@ -88,10 +88,10 @@ def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int
             left = node
             continue
         if left is not None:
-            A = se3.adjoint(marginalised[left.seq].T_a_b)
+            T = marginalised[left.seq].T_a_b
             node = replace(
                 node,
-                covariance=left.covariance + A @ node.covariance @ A.T,
+                covariance=left.covariance + se3.left_covariance(T, node.covariance),
                 prior=averaged(node, left),
                 weight=left.weight + node.weight,
             )
@@ -136,15 +136,13 @@ def moved_loops(
 def moved_loop(loop: Loop, marginalised: Mapping[int, Loop]) -> Loop:
     """The loop with its ends at the nodes before those that are marginalised."""
     if (one := marginalised.get(loop.a)) is not None:
-        A = se3.adjoint(one.T_a_b)
-        covariance = one.covariance + A @ loop.covariance @ A.T
+        covariance = one.covariance + se3.left_covariance(one.T_a_b, loop.covariance)
         loop = replace(loop, a=one.a, T_a_b=one.T_a_b @ loop.T_a_b, covariance=covariance)
     if (other := marginalised.get(loop.b)) is not None:
-        units = np.array([1.0] * 3 + [loop.ratio] * 3)
         T, covariance = reversed_motion(other.T_a_b, other.covariance)
         T[:3, 3] *= loop.ratio
-        A = se3.adjoint(loop.T_a_b)
-        covariance = loop.covariance + A @ (covariance * np.outer(units, units)) @ A.T
+        own = se3.in_units(covariance, loop.ratio)
+        covariance = loop.covariance + se3.left_covariance(loop.T_a_b, own)
         loop = replace(loop, b=other.a, T_a_b=loop.T_a_b @ T, covariance=covariance)
     return loop
 

@@ -192,11 +192,10 @@ class Trajectory:
             i = int(np.searchsorted(self._nodes, row))
             before, after = self.graph.seqs[i - 1], self.graph.node(self.graph.seqs[i])
             T = self.step_between(before, a)
-            units = np.array([1.0] * 3 + [self.graph.scale(before)] * 3)
             share = (row - self._nodes[i - 1]) / after.weight
-            step = share * after.covariance * np.outer(units, units)
-            A = se3.adjoint(T)
-            a, T_a_b, covariance = before, T @ T_a_b, step + A @ covariance @ A.T
+            step = share * se3.in_units(after.covariance, self.graph.scale(before))
+            covariance = step + se3.left_covariance(T, covariance)
+            a, T_a_b = before, T @ T_a_b
         return self.graph.add_loop(a, b, T_a_b, covariance, growth)
 
     # ---- publishing ----------------------------------------------------------------------------

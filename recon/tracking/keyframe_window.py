@@ -102,8 +102,7 @@ def step_covariance(keys: Sequence[Frame], T_camera_odom: F64) -> F64:
     """(6, 6) of a motion over consecutive keyframes, left perturbation at a camera."""
     out = np.zeros((6, 6))
     for key in keys:
-        A = se3.adjoint(T_camera_odom @ key.T_odom_camera)
-        out += A @ key.covariance @ A.T
+        out += se3.left_covariance(T_camera_odom @ key.T_odom_camera, key.covariance)
     return out
 
 
