@@ -208,7 +208,7 @@ class Segments:
         """
         growth = REFIT_GROWTH if segment.fitted < SETTLED else SETTLED_GROWTH
         due = max(MIN_KEYFRAMES, int(growth * segment.fitted))
-        if segment.keyframes < due or segment.is_tied_by_loop:
+        if segment.keyframes < due:
             return False
         segment.fitted, nodes = segment.keyframes, segment.nodes
         fresh = self._newest_constants()
@@ -224,6 +224,10 @@ class Segments:
             most = np.array([np.inf, np.inf, fresh.sigma_up_m])
             found = replace(found, sigma_fixes=np.minimum(found.sigma_fixes, most))
         before = segment.similarity
+        if before is not None and segment.is_tied_by_loop:  # which alone says where it is
+            found = replace(
+                before, mount_rad=found.mount_rad, drift_m=found.drift_m, span_s=found.span_s
+            )
         is_settled = segment.keyframes >= SETTLED and not fresh.differ(segment.constants)
         if before is not None and is_settled and not _differ(before, found, nodes):
             return False  # the graph itself follows such small changes
