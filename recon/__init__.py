@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
+    from recon.pipeline.interface import FramePosed, KeyframeReady, PosesChanged
     from recon.pipeline.mapper import Mapper, MapperConfig
     from recon.tracking.frame import Frame
     from recon.types import Camera, PointCloud, Pose, PosePrior
@@ -27,7 +27,7 @@ __all__ = [
     "PosesChanged",
 ]
 
-_ROOMS = ("recon.types", "recon.pipeline.events", "recon.pipeline.mapper")
+_ROOMS = ("recon.types", "recon.pipeline.interface", "recon.pipeline.mapper")
 
 
 def __getattr__(name: str) -> Any:

@@ -9,13 +9,12 @@ import numpy as np
 from recon import se3
 from recon.backends import Backend
 from recon.mapping.registration import IcpConfig, agreed_motion
-from recon.pipeline.config import Timing
+from recon.pipeline.interface import Timing
 from recon.pipeline.views import StereoView
-from recon.posegraph.ground_heights import height_above, height_below
-from recon.posegraph.level_ground import MAX_LEVELLED_SHARE, levelled
+from recon.posegraph.ground import MAX_LEVELLED_SHARE, height_above, height_below, levelled
 from recon.posegraph.loop_search import LoopSearch
-from recon.posegraph.pieces import apart
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.segments import apart
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
 from recon.types import F64, DepthMap, Keyframe, Pose, Verdict

@@ -17,9 +17,16 @@ from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.mapping.voxel_map import VoxelMap, ground_sample_m
-from recon.pipeline.config import MapperConfig, Timing, untimed
-from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import FramePoses
+from recon.pipeline.interface import (
+    Event,
+    FramePosed,
+    KeyframeReady,
+    MapperConfig,
+    PosesChanged,
+    Timing,
+    untimed,
+)
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import (
     DenseStereo,

@@ -13,7 +13,7 @@ from recon import se3
 from recon.backends import Backend, DenseStages
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
-from recon.pipeline.config import CONTRADICTED, Timing
+from recon.pipeline.interface import CONTRADICTED, Timing
 from recon.pipeline.views import StereoView
 from recon.posegraph.segments import Segments
 from recon.stereo.depth_edges import drop_edges

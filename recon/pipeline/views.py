@@ -14,7 +14,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.pipeline.config import TWO_ONLY
+from recon.pipeline.interface import TWO_ONLY
 from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import NEAR_S, depth_share, on_image
 from recon.row_errors import turn_shares

@@ -23,8 +23,7 @@ from recon.posegraph.alignment_readings import (
     AlignmentReadings,
     ReadingNoise,
 )
-from recon.posegraph.ground_heights import GUESSED_SHARE, INDEPENDENT_HEIGHTS
-from recon.posegraph.level_ground import ASSUMED_TILT_RAD
+from recon.posegraph.ground import ASSUMED_TILT_RAD, GUESSED_SHARE, INDEPENDENT_HEIGHTS
 from recon.posegraph.pose_priors import has_fix
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import (

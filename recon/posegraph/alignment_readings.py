@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from recon import se3
-from recon.posegraph.ground_heights import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
+from recon.posegraph.ground import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import MIN_FIX_M, has_fix, off_attitudes
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S, Noise, bias_time_constant_s, inflation

@@ -14,7 +14,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.alignment_readings import ReadingNoise
-from recon.posegraph.ground_heights import height_ratio
+from recon.posegraph.ground import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_attitudes
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.segments import Segments

@@ -83,7 +83,7 @@ class PoseGraph:
             covariance: (6, 6) of the motion since the last keyframe, a left perturbation in
                 the last camera's frame, in units of the odometry.
             prior: telemetry at this moment; parts may be missing.
-            height: above ground as :func:`recon.posegraph.ground_heights.height_above` gives it.
+            height: above ground as :func:`recon.posegraph.ground.height_above` gives it.
         """
         above, lean = height if height is not None else (None, 0.0)
         node = Node(

@@ -13,7 +13,7 @@ import numpy as np
 
 from recon import parallel, se3
 from recon.posegraph.alignment_readings import Alignment, from_middle
-from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
+from recon.posegraph.ground import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import off_attitudes
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S

@@ -11,7 +11,7 @@ import numpy as np
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy, rpy_from_rotation
-from recon.posegraph.level_ground import ASSUMED_TILT_RAD
+from recon.posegraph.ground import ASSUMED_TILT_RAD
 from recon.types import F64, PosePrior
 from service.cameras.source import GeoTag
 from service.config import CameraConfig, FusionConfig, ScanConfig

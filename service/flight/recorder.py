@@ -14,9 +14,9 @@ import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
-from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import pose_at
-from recon.posegraph.ground_heights import GUESSED_SHARE
+from recon.pipeline.interface import Event, FramePosed, KeyframeReady, PosesChanged
+from recon.posegraph.ground import GUESSED_SHARE
 from recon.poses import sigma_m
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Keyframe, Pose

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.pipeline.config import CONTRADICTED, TWO_ONLY
+from recon.pipeline.interface import CONTRADICTED, TWO_ONLY
 from recon.plane import plane_through
 from recon.types import F32, F64, Array
 from service.scans.main_piece import main_track

@@ -12,7 +12,7 @@ from some_views import view_at
 
 from recon import se3
 from recon.backends import Backend
-from recon.pipeline.config import untimed
+from recon.pipeline.interface import untimed
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.posegraph.trajectory import Trajectory
 from recon.types import DepthMap, Registration, Verdict

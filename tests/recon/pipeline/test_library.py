@@ -16,7 +16,7 @@ from some_views import view_at
 
 import recon
 from recon import se3
-from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.interface import FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.mapper import Mapper, MapperConfig, Reconstructed, moved
 from recon.pipeline.views import StereoView, ViewSelection
 from recon.tracking.frame import Frame, Tracking

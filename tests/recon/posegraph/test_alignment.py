@@ -13,7 +13,7 @@ from recon import se3
 from recon.camera_model import rays
 from recon.posegraph import alignment
 from recon.posegraph.alignment import fit, scales
-from recon.posegraph.ground_heights import height_above, height_below
+from recon.posegraph.ground import height_above, height_below
 from recon.posegraph.records import Node
 from recon.types import F32, F64, DepthMap, PosePrior, Travel
 

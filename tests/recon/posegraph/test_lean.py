@@ -11,7 +11,7 @@ from flown_track import node
 from recon import se3
 from recon.posegraph.alignment import fit
 from recon.posegraph.alignment_readings import Alignment
-from recon.posegraph.level_ground import ASSUMED_TILT_RAD, LEVEL_SIGMA_RAD
+from recon.posegraph.ground import ASSUMED_TILT_RAD, LEVEL_SIGMA_RAD
 from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior

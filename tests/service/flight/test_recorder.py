@@ -16,7 +16,7 @@ from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import PositionSample
 from recon import se3
 from recon.camera_model import scaled_K
-from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.interface import FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.alignment import Scale
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.pose_graph import PoseGraph

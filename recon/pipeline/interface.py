@@ -1,10 +1,13 @@
-"""Parameters of the pipeline, and what it is timed with."""
+"""What a :class:`recon.pipeline.mapper.Mapper` is given, and the events by which it answers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from recon.tracking.frame import Frame
+from recon.types import Array, Keyframe, Pose
 
 Timing = Callable[[str], AbstractContextManager[object]]
 """Gives a stage by name the context that it runs in."""
@@ -42,3 +45,36 @@ class MapperConfig:
     resolution_m: float = 0.0  # of the map, at least; 0: as fine as the images
     keeps_debug: bool = False  # the images of each view's stages
     first_depths: bool = False  # of views whose partners have not come, while no work waits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePosed:
+    """A frame went through tracking. One that was lost comes again where the next one places it."""
+
+    frame: Frame  # without its images; ``relative`` gives its pose again, as known later
+    pose: Pose | None = None  # in the world; by telemetry alone when vision fails
+    is_view: bool = False  # the frame takes part in stereo and may become a keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeReady:
+    """A view has become a keyframe, with the depth of all its partners.
+
+    ``is_first_depth``: only what one partner shows, to look at now. The same view comes again with
+    its whole depth, unless it is refused. ``stages``: the images of its stages, by name, where they
+    are kept.
+    """
+
+    keyframe: Keyframe
+    is_first_depth: bool = False
+    stages: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosesChanged:
+    """Better poses of keyframes that came before, by number."""
+
+    poses: Mapping[int, Pose]
+
+
+Event = FramePosed | KeyframeReady | PosesChanged
