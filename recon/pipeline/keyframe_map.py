@@ -14,7 +14,6 @@ from recon.pipeline.views import StereoView
 from recon.posegraph.ground import MAX_LEVELLED_SHARE, height_above, height_below, levelled
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.segments import apart
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
 from recon.types import F64, DepthMap, Keyframe, Pose, Verdict
@@ -123,7 +122,7 @@ class KeyframeMap:
 
     def apart(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
-        return apart(self.graph.segments, self.graph.loops)
+        return self.graph.segments.apart(self.graph.loops)
 
     def false(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch in which vision is wrong, and its depth, too."""

@@ -19,7 +19,7 @@ from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.records import Loop
-from recon.posegraph.segments import Segment, Segments, apart
+from recon.posegraph.segments import Segment, Segments
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
@@ -81,7 +81,7 @@ def apart(
         segment = ties.segment(segments, number)
         for i in range(3):
             segment.add_surface(10 * number + i, count, prior)
-    return apart(segments, ties.taken)
+    return segments.apart(ties.taken)
 
 
 def test_without_ties_the_largest_stays() -> None:
@@ -138,7 +138,7 @@ def test_a_segment_without_nodes_is_tied_as_it_was() -> None:
         segment = Ties(fixed=(1,)).segment(segments, number)
         segment.add_surface(10 * number, count, NOWHERE)
     segments.thin([])
-    assert apart(segments, []) == [(20, 20)]
+    assert segments.apart([]) == [(20, 20)]
 
 
 def replayed(tmp_path: Path, track: list[F64]) -> tuple[dict[str, Any], F64]:
