@@ -17,6 +17,7 @@ from recon.posegraph.ground import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import off_attitudes
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
+from recon.similarity import lever
 from recon.types import F64, PosePrior
 
 SIGMA_RAD = np.radians(2.0)
@@ -65,6 +66,10 @@ class Constants:
     span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
     turn_world: F64 = field(default_factory=lambda: np.zeros(3))  # takes attitudes to it
     log_height: float = 0.0  # log of the alignment's scale over that of the heights
+    centre_m: F64 = field(default_factory=lambda: np.zeros(3))  # of the fixes
+    shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to it
+    warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # per metre off centre
+    reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
     is_exact: bool = False  # only heights of the ground exactly below count
 
     @property
@@ -82,6 +87,9 @@ class Constants:
         if position is not None:
             drift_m = self.drift_m * float(from_middle(time_s, *self.span_s))
             position = position + np.array([0.0, 0.0, self.up_m]) - np.array([0.0, 0.0, drift_m])
+            off = position - self.centre_m
+            off = off * min(1.0, self.reach_m / max(float(np.linalg.norm(off)), 1e-9))
+            position = position + self.shift_m + self.warp @ off
         if agl is not None:
             is_relief = self.is_exact and lean > 0.0
             agl = None if is_relief else agl * float(np.exp(self.log_height))
@@ -229,11 +237,14 @@ def _wandered(above: F64, fixes: F64, white: float) -> float:
     return apart - scatter if apart > BY_CHANCE * scatter else 0.0
 
 
+PRIOR_SIGMA = 0.1
+"""rad and share; how far fixes may be turned and stretched against the frame."""
+
 MAX_OFFSET_RAD = 0.2
 """Attitudes that are further off are at fault, for the gates to find: no offset to take out."""
 
 NEAR_SIGMAS = 5.0
-"""Attitudes further from their median are no part of a constant."""
+"""Fixes further from the track, or attitudes from their median, are no part of a constant."""
 
 
 def constants(
@@ -262,10 +273,11 @@ def with_offsets(known: Constants, nodes: Sequence[Node], frame: Alignment) -> C
     if ratios:
         mean = np.average([r[0] for r in ratios], weights=[r[1] ** -2 for r in ratios])
         log_height = float(np.log(frame.scale) - mean)
+    centre_m, shift_m, warp, reach_m = _fixes(nodes, frame)
     return replace(
         known, mount_rad=frame.mount_rad, drift_m=frame.drift_m, span_s=frame.span_s,
-        turn_world=_turn(nodes, frame), log_height=log_height,
-        is_exact=independent == EXACT_HEIGHTS,
+        turn_world=_turn(nodes, frame), log_height=log_height, centre_m=centre_m, shift_m=shift_m,
+        warp=warp, reach_m=reach_m, is_exact=independent == EXACT_HEIGHTS,
     )  # fmt: skip
 
 
@@ -281,3 +293,28 @@ def _turn(nodes: Sequence[Node], frame: Alignment) -> F64:
     near = np.all(np.abs(turns - np.median(turns, axis=0)) < NEAR_SIGMAS * sigma, axis=1)
     turn = turns[near].mean(axis=0) if near.any() else np.zeros(3)
     return turn if np.linalg.norm(turn) < MAX_OFFSET_RAD else np.zeros(3)
+
+
+def _fixes(nodes: Sequence[Node], frame: Alignment) -> tuple[F64, F64, F64, float]:
+    """Centre, shift, warp (3, 3) and reach of the fixes, turned and stretched about the centre."""
+    nothing = np.zeros(3), np.zeros(3), np.zeros((3, 3)), 0.0
+    rows = [
+        (frame.points(a.place_of_fix), a.prior.position_m, a.prior.sigma_position_m)
+        for a in nodes
+        if a.prior.position_m is not None and a.prior.sigma_position_m is not None
+    ]
+    if len(rows) < 3:
+        return nothing
+    track, fixes, sigma = (np.array(column, np.float64) for column in zip(*rows, strict=True))
+    near = np.all(np.abs(track - fixes) < NEAR_SIGMAS * sigma, axis=1)
+    if near.sum() < 3:
+        return nothing
+    apart, weight = (track - fixes)[near], 1.0 / sigma[near]
+    centre = fixes[near].mean(axis=0)
+    p = fixes[near] - centre
+    A = lever(p)[:, :, [3, 4, 5, 0, 1, 2, 6]]  # shift, turn, stretch
+    A = (A * weight[:, :, None]).reshape(-1, 7)
+    H = A.T @ A + np.diag([0.0] * 3 + [PRIOR_SIGMA**-2] * 4)
+    x = np.linalg.solve(H, A.T @ (apart * weight).ravel())
+    reach_m = float(np.linalg.norm(p, axis=1).max())
+    return centre, x[:3], se3.hat(x[3:6]) + x[6] * np.eye(3), reach_m
