@@ -139,9 +139,6 @@ class Factors:
         weight = np.minimum(1.0, self.huber / np.maximum(length, 1e-12))
         return weight, weight * length * (length - 0.5 * weight * length)
 
-    def about(self, at: State) -> Linear:
-        return self.form(self.table.rows, at)
-
 
 @dataclass(frozen=True, eq=False)
 class System:
@@ -159,7 +156,7 @@ class System:
         held = np.array([first_log + NO_SCALE])
         values, rows, columns, g, cost = [np.ones(1)], [held], [held], np.zeros(count), 0.0
         for one in factors:
-            error, J, unknowns = one.about(at)
+            error, J, unknowns = one.form(one.table.rows, at)
             weight, costs = one.loss(np.linalg.norm(error, axis=1))
             cost += float(np.sum(costs))
             JW, width = J.transpose(0, 2, 1) * weight[:, None, None], unknowns.shape[1]
@@ -326,7 +323,8 @@ class Smoother:
         """
         if self._waiting:
             return {}
-        return {kind: one.about(self._held.at)[0] for kind, one in self.factors.items()}
+        at = self._held.at
+        return {kind: one.form(one.table.rows, at)[0] for kind, one in self.factors.items()}
 
 
 def reversed_motion(T: F64, covariance: F64) -> tuple[F64, F64]:

@@ -14,8 +14,9 @@ from recon.types import F64, I64, Bool, PosePrior
 MIN_MEASURED = 12
 """Landmarks that give a scale."""
 
-RELIEF = 0.05
-"""Share of the inverse depth by which ground lies off its plane, at most: trees and houses do."""
+RELIEF, SCATTERS = 0.05, 4.5
+"""Points lie off their plane by this share of the inverse depth at first, then by so many times the
+median of what they do: ground is rough or smooth."""
 
 
 def inverse_depth_plane(P: F64) -> F64:
@@ -23,8 +24,12 @@ def inverse_depth_plane(P: F64) -> F64:
     if len(P) < 3:
         return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
     near = 1.0 / P[:, 2:]
-    usual = np.median(near, axis=0)
-    trend = matching.affine_trend(P[:, :2] * near, near, RELIEF * abs(usual[0]))
+    at, tolerance = P[:, :2] * near, RELIEF * float(np.median(near))
+    trend, off = np.zeros((3, 1)), near
+    for _ in range(2):
+        trend += matching.affine_trend(at, off, tolerance)
+        off = near - trend[0] - at @ trend[1:]
+        tolerance = max(SCATTERS * float(np.median(np.abs(off))), 1e-9)
     return np.asarray(trend[[1, 2, 0], 0])
 
 

@@ -96,8 +96,7 @@ class DaemonLink:
         self._lock = threading.Lock()
         self.sender: DatalinkSender | None = None  # of the running scan
         self.backlog: DatalinkSender | None = None
-        self._wants_backlog = False
-        self._serial = 0  # of the last wish for the backlog
+        self._wish: object | None = None  # for the backlog, each one of its own
         self._radio: VehicleRadio | None = None
 
     def begin_scan(self, store: ScanStore, config: Config, vehicle: VehicleLink) -> None:
@@ -138,14 +137,12 @@ class DaemonLink:
         Ends with :meth:`begin_scan` or :meth:`end_backlog`.
         """
         with self._lock:
-            if self._wants_backlog or not is_idle():
+            if self._wish is not None or not is_idle():
                 return
-            self._wants_backlog = True
-            self._serial += 1
-            serial = self._serial
-        PROCESS.start("backlog", lambda _: self._open_backlog(config, serial))
+            self._wish = wish = object()
+        PROCESS.start("backlog", lambda _: self._open_backlog(config, wish))
 
-    def _open_backlog(self, config: Config, serial: int) -> None:
+    def _open_backlog(self, config: Config, wish: object) -> None:
         """Open it, which may read much of the disk, unless it has been cancelled meanwhile."""
         try:
             sender = open_backlog(config)
@@ -153,7 +150,7 @@ class DaemonLink:
             log.error("earlier scans are not offered: %s", error)
             return
         with self._lock:
-            if self._wants_backlog and self._serial == serial:
+            if self._wish is wish:
                 self.backlog, sender = sender, None
         if sender is not None:
             sender.close()
@@ -162,7 +159,7 @@ class DaemonLink:
         """End the backlog, after :func:`deliver` if it may take a while; a separate thread closes
         the rest."""
         with self._lock:
-            self._wants_backlog = False
+            self._wish = None
             sender, self.backlog = self.backlog, None
         if sender is not None:
             if deliver_s:

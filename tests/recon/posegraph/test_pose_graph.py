@@ -374,6 +374,20 @@ def test_breaks_in_vision_do_not_swing_the_track(seed: int) -> None:
     assert np.abs(z_m).max() < 1.5
 
 
+def test_fixes_that_drift_do_not_stretch_the_graph_beyond_the_similarity() -> None:
+    """Heights measure the scale better, and the similarity weighs both. Were fixes to enter the
+    graph as they are, it would be 1.4 % too large."""
+    f, graph = flight(60, turn_every=100), PoseGraph(bias_tau_s=BIAS_TAU_S)
+    middle = np.mean([T[:3, 3] for T in f.truth], axis=0)
+    for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
+        assert prior.position_m is not None
+        drift_m = 0.02 * (f.truth[i][:3, 3] - middle) * [1.0, 1.0, 0.0]
+        prior = replace(prior, position_m=prior.position_m + drift_m, agl_m=60.0, sigma_agl_m=0.3)
+        graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, (60.0 / 1.3, 0.0))
+    graph.solve()
+    assert graph.scale(30) == pytest.approx(1.3, rel=0.006)
+
+
 def circle(drift_sigma: float = 0.01) -> Flight:
     """A closed square flown one and a half times, without fixes."""
     f = flight(61, scale=1.0, drift=drift_sigma, turn_every=10, seed=3)
