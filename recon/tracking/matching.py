@@ -22,38 +22,34 @@ from recon.types import F32, F64, U8, Bool
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _reweighted(uv: Any, values: Any, first: Any, tolerance: float, trend: Any) -> None:
-    """Fill ``trend`` (3, d) from the constant ``first`` (d,): each fit has the weights of the one
-    before, with a tolerance that narrows from eightfold to itself."""
+def affine_trend(uv: Any, moves: Any, first: Any, tolerance: float, trend: Any) -> None:
+    """Fill ``trend`` (3, 2): ``moves`` (N, 2) as 1, u / 1000, v / 1000 times it, robustly.
+
+    Reweighted from ``first`` (2,) with a tolerance that narrows from eightfold to itself.
+    """
     trend[:] = 0.0
-    trend[0, :] = first
-    row = np.ones(3)
+    trend[0, 0], trend[0, 1] = first[0], first[1]
+    row = np.empty(3)
     for sharpness in (0.125, 0.25, 0.5, 1.0, 1.0):
-        H, g = 1e-6 * np.eye(3), np.zeros_like(trend)
+        H, g = np.zeros((3, 3)), np.zeros((3, 2))
+        for k in range(3):
+            H[k, k] = 1e-6
         for p in range(uv.shape[0]):
-            row[1], row[2] = uv[p, 0], uv[p, 1]
-            square = 0.0
-            for j in range(values.shape[1]):
-                off = values[p, j] - trend[0, j] - row[1] * trend[1, j] - row[2] * trend[2, j]
-                square += off * off
-            share = square * (sharpness / tolerance) ** 2
+            row[0], row[1], row[2] = 1.0, uv[p, 0] / 1000, uv[p, 1] / 1000
+            du, dv = moves[p, 0], moves[p, 1]
+            for k in range(3):
+                du -= row[k] * trend[k, 0]
+                dv -= row[k] * trend[k, 1]
+            share = (du * du + dv * dv) * (sharpness / tolerance) ** 2
             weight = 1.0 / ((1.0 + share) * (1.0 + share))
             for k in range(3):
-                for j in range(values.shape[1]):
-                    g[k, j] += weight * row[k] * values[p, j]
+                g[k, 0] += weight * row[k] * moves[p, 0]
+                g[k, 1] += weight * row[k] * moves[p, 1]
                 for m in range(3):
                     H[k, m] += weight * row[k] * row[m]
         solve_symmetric(H, g)
-        trend[:] = g
-
-
-def affine_trend(uv: F64, values: F64, tolerance: float) -> F64:
-    """(3, d) c with ``c[0] + uv @ c[1:]`` for the ``values`` (N, d) of most places (N, 2)."""
-    reach = max(float(np.abs(uv).max()), 1e-9)
-    trend = np.empty((3, values.shape[1]))
-    _reweighted(uv / reach, values, np.median(values, axis=0), tolerance, trend)
-    trend[1:] /= reach
-    return trend
+        for k in range(3):
+            trend[k, 0], trend[k, 1] = g[k, 0], g[k, 1]
 
 
 @njit(inline="always", fastmath=True)
@@ -284,8 +280,9 @@ def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 |
     if np.count_nonzero(good) < 12:
         return None
     x, y = uv[good], residual[good]
-    trend = affine_trend(x, y, tolerance_px)
-    everywhere = trend[0] + uv @ trend[1:]
+    trend = np.empty((3, 2))
+    affine_trend(x, y, np.median(y, axis=0), tolerance_px, trend)
+    everywhere = trend[0] + uv @ (trend[1:] / 1000.0)
     agree = np.hypot(*(y - everywhere[good]).T) < 2 * tolerance_px
     if np.count_nonzero(agree) < max(12, 0.4 * len(y)):
         return None

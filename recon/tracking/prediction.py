@@ -4,33 +4,51 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 
 from recon import se3
 from recon.camera_model import rays
-from recon.tracking import matching, robust_geometry, two_view
+from recon.small_matrices import solve_symmetric
+from recon.tracking import robust_geometry, two_view
 from recon.tracking.frame import Frame
 from recon.types import F64, I64, Bool, PosePrior
 
 MIN_MEASURED = 12
 """Landmarks that give a scale."""
 
-RELIEF, SCATTERS = 0.05, 4.5
-"""Points lie off their plane by this share of the inverse depth at first, then by so many times the
-median of what they do: ground is rough or smooth."""
-
 
 def inverse_depth_plane(P: F64) -> F64:
-    """(3,) q with ``1 / z = q . ray`` for the plane that most camera points (N, 3) lie near."""
+    """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
     if len(P) < 3:
         return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
-    near = 1.0 / P[:, 2:]
-    at, tolerance = P[:, :2] * near, RELIEF * float(np.median(near))
-    trend, off = np.zeros((3, 1)), near
-    for _ in range(2):
-        trend += matching.affine_trend(at, off, tolerance)
-        off = near - trend[0] - at @ trend[1:]
-        tolerance = max(SCATTERS * float(np.median(np.abs(off))), 1e-9)
-    return np.asarray(trend[[1, 2, 0], 0])
+    return np.asarray(_robust_plane(np.ascontiguousarray(P, np.float64)))
+
+
+@njit(cache=True, nogil=True)
+def _robust_plane(P: F64) -> F64:  # pragma: no cover - compiled
+    """Iteratively reweighted least squares of the inverse depths."""
+    N = len(P)
+    q, error, row, H = np.zeros((3, 1)), np.empty(N), np.empty(3), np.empty((3, 3))
+    scale = np.inf
+    for _ in range(5):
+        H[:, :] = 0.0
+        q[:, 0] = 0.0
+        for m in range(N):
+            w = 1.0 / P[m, 2]
+            row[0], row[1], row[2] = P[m, 0] * w, P[m, 1] * w, 1.0
+            weight = 1.0 / (1.0 + (error[m] / (2 * scale)) ** 2) if scale < np.inf else 1.0
+            for i in range(3):
+                q[i, 0] += weight * row[i] * w
+                for j in range(3):
+                    H[i, j] += weight * row[i] * row[j]
+        for i in range(3):
+            H[i, i] += 1e-9
+        solve_symmetric(H, q)
+        for m in range(N):
+            w = 1.0 / P[m, 2]
+            error[m] = abs(w * (P[m, 0] * q[0, 0] + P[m, 1] * q[1, 0] - 1.0) + q[2, 0])
+        scale = max(1.4826 * np.median(error), 1e-9)
+    return q[:, 0]
 
 
 def common_affine(uv: F64, there: F64) -> F64:
