@@ -9,11 +9,11 @@ bytes   content
 J       JSON: ``seq``, ``layer``, ``time_unix_s``; ``size`` w, h of the layer's grid and its
         ``K`` fx, fy, cx, cy; ``box``, ``low`` and ``step`` as in docs/wire.md; ``T`` (16, column
         by column) and ``scale`` in force; ``bytes`` of the sections
-..      sections: mask, depth (prediction), sigma, views, colour
+..      sections: mask, depth (prediction), sigma, views, colour, image
 ======  =======================================================================
 
-Mask, depth and colour are the bytes of docs/wire.md, as they are stored; sigma and views are their
-codes under zlib in place of JPEG-LS, which browsers do not decode. Depth stays in the camera's
+Mask, depth, colour and the small image of the whole keyframe (empty where there is none) are the
+bytes of docs/wire.md, as they are stored; sigma and views are their codes under zlib in place of JPEG-LS, which browsers do not decode. Depth stays in the camera's
 frame, so a correction is a new matrix and scale. JSON texts have a ``type``: ``repose``, ``track``,
 ``state``, ``site`` (where this scan and those tied to it are shown), and once a second ``link``.
 """
@@ -68,7 +68,7 @@ def chunk_message(store: ScanStore, seq: int, layer: int) -> bytes | None:
     if opened is None:
         return None
     head, (mask, depth, sigma, views, colour) = opened
-    sections = mask, depth, _codes(sigma), _codes(views), colour
+    sections = mask, depth, _codes(sigma), _codes(views), colour, store.image(seq) or b""
     repose = store.repose(seq)
     K = head.grid_K
     text = json.dumps(
@@ -93,7 +93,7 @@ def chunk_message(store: ScanStore, seq: int, layer: int) -> bytes | None:
 def emptied(message: bytes) -> bytes:
     """A chunk's message without any of its pixels."""
     (size,) = struct.unpack_from("<I", message)
-    head = json.loads(message[4 : 4 + size]) | {"box": [0] * 4, "bytes": [0] * 5}
+    head = json.loads(message[4 : 4 + size]) | {"box": [0] * 4, "bytes": [0] * 6}
     text = json.dumps(head).encode()
     return struct.pack("<I", len(text)) + text
 

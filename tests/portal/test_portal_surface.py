@@ -13,13 +13,13 @@ from recon.types import F64
 RESULT = """[0, 1, 2, 3, 4].map((level) => {
   const { codes, sigma, ...head } = given;
   const arrays = { codes: Uint32Array.from(codes), sigma: Uint8Array.from(sigma), views: [] };
-  const { pixel, index } = page.triangulate({ ...head, ...arrays }, level);
-  return { pixel: [...pixel], index: [...index] };
+  const { pixel, at, index } = page.triangulate({ ...head, ...arrays }, level);
+  return { pixel: [...pixel], at: [...at], index: [...index] };
 })"""
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 320, 180, 300.0
 GROUND_M, ROOF_M, NOISE_M = 60.0, 52.0, 0.02
 LOW, STEP = 0.01, 2e-7
-SKIRT, OUTSIDE_PX = 32768, 16
+SKIRT, OUTSIDE_PX, EDGE_PX = 32768, 16, 8
 ROOF = np.s_[50:130, 101:223]
 
 pytestmark = NEEDS_NODE
@@ -38,6 +38,7 @@ def flat_roof() -> dict[str, Any]:
         "codes": codes.ravel().tolist(),
         "sigma": [1 + int(4 * np.log2(NOISE_M / 0.001))] * blocks,
         "w": WIDTH_PX, "h": HEIGHT_PX, "box": [0, 0, WIDTH_PX, HEIGHT_PX],
+        "size": [WIDTH_PX, HEIGHT_PX], "isWhole": True,
         "K": [FOCAL_PX, FOCAL_PX, WIDTH_PX / 2, HEIGHT_PX / 2], "low": LOW, "step": STEP,
     }  # fmt: skip
 
@@ -71,3 +72,18 @@ def test_no_level_joins_a_roof_to_the_ground(tmp_path_factory: pytest.TempPathFa
         assert area(places[is_roof]) > (high - 2 * side) * (wide - 2 * side), level
         around = 2 * side * (high + wide + 2 * side)
         assert area(places[~is_roof]) > left - tops.sum() - around, level
+
+
+@pytest.mark.slow
+def test_a_skirt_has_the_colours_of_its_own_place(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Where the keyframe's whole image shows them; beyond that those of its border."""
+    shown = web_module(tmp_path_factory.mktemp("skirts"), "surface", RESULT)
+    size = np.array([WIDTH_PX, HEIGHT_PX])
+    for is_whole in (True, False):
+        (grid, *_) = shown({**flat_roof(), "isWhole": is_whole})
+        pixel = np.array(grid["pixel"], float).reshape(-1, 4)[:, :2] - OUTSIDE_PX
+        pixel[:, 0] -= SKIRT * (pixel[:, 0] > SKIRT / 2)
+        at = np.array(grid["at"], float).reshape(-1, 2) / 65535 * (size + 2 * EDGE_PX)
+        away = np.abs(at - EDGE_PX - 0.5 - np.clip(pixel, 0, size - 1)).max(axis=1)
+        assert (pixel.min() < 0) and (away.max() < 0.1) == is_whole
+        assert away.max() < 3.0  # else those of the nearest measured pixel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from spied import spied
 
 from service.ground.live import LiveFeed
 from service.stream import codec, radio_messages, store
+from service.stream.images import encode_image
 from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose
 from service.stream.store import ScanStore
 
@@ -118,6 +120,19 @@ def test_a_first_depth_is_shown_until_it_is_replaced_or_void(
     assert shown() == [(7, -2, 0), (8, -2, 80)]
     scan.add_keyframe(8, layers[8])
     assert shown() == [(8, 1, 160)]
+
+
+def test_a_chunk_carries_the_image_of_its_whole_keyframe(
+    scan: ScanStore, feed: LiveFeed, house: HouseFlight
+) -> None:
+    one = house.keyframe(9, 45.0)
+    image = encode_image(one.bgr)
+    scan.add_keyframe(9, [*codec.encode(one, 1)], image)
+    (message,) = [m for m in feed.news() if isinstance(m, bytes)][-1:]
+    assert message.endswith(image)
+    (size,) = struct.unpack_from("<I", message)
+    sections = json.loads(message[4 : 4 + size])["bytes"]
+    assert len(sections) == 6 and 4 + size + sum(sections) == len(message)
 
 
 def test_text_in_place_of_numbers_is_left_out(scan: ScanStore, feed: LiveFeed) -> None:

@@ -26,8 +26,14 @@ export interface Chunk extends Head {
   sigma: Uint8Array;
   /** Views of 2x2 pixels; empty: one. */
   views: Uint8Array;
+  /** Of the box and of EDGE_PX around it: as measured where that is known, else as the whole keyframe's image shows it. */
   colour: ImageBitmap | null;
+  /** There is such an image. */
+  isWhole: boolean;
 }
+
+/** Pixels around the box whose colours are known. */
+export const EDGE_PX = 8;
 
 /** The layer of a first depth, of a keyframe that is still to come. */
 export const FIRST = -2;
@@ -45,23 +51,47 @@ export async function decode(data: ArrayBuffer): Promise<Chunk> {
   const length = new DataView(data).getUint32(0, true);
   const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Head;
   let at = 4 + length;
-  const [mask, depth, sigma, views, colour] = head.bytes.map((n) => new Uint8Array(data, (at += n) - n, n)) as [
-    Uint8Array<ArrayBuffer>, Uint8Array<ArrayBuffer>, Uint8Array<ArrayBuffer>, Uint8Array<ArrayBuffer>, Uint8Array<ArrayBuffer>,
-  ];
+  const sections = head.bytes.map((n) => new Uint8Array(data, (at += n) - n, n));
+  const [mask, depth, sigma, views, colour, small] = sections as [Bytes, Bytes, Bytes, Bytes, Bytes, Bytes];
   const [, , w, h] = head.box;
   const none = new Uint8Array(0);
-  if (!w) return { ...head, w, h, codes: new Uint32Array(0), sigma: none, views: none, colour: null };
+  if (!w) return { ...head, w, h, codes: new Uint32Array(0), sigma: none, views: none, colour: null, isWhole: false };
   const known = knownPixels(mask, w, h);
-  const [symbols, sigmas, counts, image] = await Promise.all([
+  const [symbols, sigmas, counts, own, whole] = await Promise.all([
     inflated(depth.subarray(18)),
     inflated(sigma),
     inflated(views),
-    createImageBitmap(new Blob([colour], { type: "image/jpeg" }), { colorSpaceConversion: "none", premultiplyAlpha: "none" }),
+    opened(colour),
+    small.length ? opened(small).catch(() => null) : null, // it may come from anybody
   ]);
   const codes = restored(depth, symbols, known, w, h);
   const nearest = (1 / NEAREST_M - head.low) / head.step;
   for (let i = 0; i < codes.length; i++) if (codes[i]! > nearest) codes[i] = 0;
-  return { ...head, w, h, codes, sigma: sigmas, views: counts, colour: image };
+  return { ...head, w, h, codes, sigma: sigmas, views: counts, colour: completed(head, codes, own, whole), isWhole: whole !== null };
+}
+
+type Bytes = Uint8Array<ArrayBuffer>;
+
+const opened = (jpeg: Bytes): Promise<ImageBitmap> =>
+  createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }), { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+
+/** The colours of the box and its edge: the layer's own are noise where nothing is new. */
+function completed({ box, size }: Head, codes: Uint32Array, own: ImageBitmap, whole: ImageBitmap | null): ImageBitmap {
+  const [x, y, w, h] = box;
+  const [across, down] = [w + 2 * EDGE_PX, h + 2 * EDGE_PX];
+  const context = new OffscreenCanvas(across, down).getContext("2d", { willReadFrequently: true })!;
+  context.drawImage(own, EDGE_PX, EDGE_PX);
+  if (whole) {
+    const measured = context.getImageData(EDGE_PX, EDGE_PX, w, h).data;
+    context.imageSmoothingQuality = "high";
+    context.drawImage(whole, EDGE_PX - x, EDGE_PX - y, size[0], size[1]);
+    const all = context.getImageData(EDGE_PX, EDGE_PX, w, h);
+    for (let i = 0; i < codes.length; i++) if (codes[i]) all.data.set(measured.subarray(4 * i, 4 * i + 3), 4 * i);
+    context.putImageData(all, EDGE_PX, EDGE_PX);
+    whole.close();
+  }
+  own.close();
+  return context.canvas.transferToImageBitmap();
 }
 
 async function inflated(data: Uint8Array<ArrayBuffer>): Promise<Uint8Array> {

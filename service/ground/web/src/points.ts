@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import type { Part } from "./api";
 import { Before, CHANGE } from "./before";
-import { type Chunk, FIRST, isVoid, sigmaAt, viewsAt } from "./depth";
+import { type Chunk, EDGE_PX, FIRST, isVoid, sigmaAt, viewsAt } from "./depth";
 import { Ground, type Samples } from "./fill";
 import type { Gradual } from "./painter";
 import { BEHIND, LEVELS, Surface } from "./surface";
@@ -617,6 +617,6 @@ function pointsOf(chunk: Chunk): { xyz: Int16Array; rgb: Uint8Array; sigma: Uint
 
 function pixelsOf(image: ImageBitmap, w: number, h: number): Uint8ClampedArray {
   const context = new OffscreenCanvas(w, h).getContext("2d", { willReadFrequently: true })!;
-  context.drawImage(image, 0, 0);
+  context.drawImage(image, -EDGE_PX, -EDGE_PX);
   return context.getImageData(0, 0, w, h).data;
 }

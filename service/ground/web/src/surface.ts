@@ -2,7 +2,7 @@
 // vertex shader displaces along the rays of its camera.
 
 import * as THREE from "three";
-import { type Chunk, FIRST, sigmaAt, viewsAt } from "./depth";
+import { type Chunk, EDGE_PX, FIRST, sigmaAt, viewsAt } from "./depth";
 
 /** Pixels of the depth image between two vertices, by level. */
 const STEPS = [1, 2, 4, 8, 16];
@@ -229,7 +229,7 @@ export function triangulate(chunk: Chunk, level: number): Grid {
   const code = new Float32Array(n).fill(-1);
   const isGrown = new Uint8Array(n);
   const [x, y] = [new Int16Array(n), new Int16Array(n)]; // of the vertex
-  const from = new Int32Array(n); // the pixel whose colour and sigma it has
+  const from = new Int32Array(n); // the pixel whose sigma it has, and its colour where no image shows more
   const half = side >> 1;
   const reach = Math.max(half, 1); // of a skirt, from the last known pixel of a block
   for (let j = ring; j < rows - ring; j++)
@@ -345,6 +345,13 @@ export function triangulate(chunk: Chunk, level: number): Grid {
     }
   }
 
+  /** Where the middle of a pixel, or of the image's nearest one, lies along an axis of the texture, 0 to 1. */
+  function within(pixel: number, axis: number): number {
+    const [first, size, side] = [chunk.box[axis]!, chunk.size[axis]!, chunk.box[2 + axis]!];
+    const inImage = Math.min(Math.max(pixel, -first), size - 1 - first);
+    return Math.min(Math.max((inImage + EDGE_PX + 0.5) / (side + 2 * EDGE_PX), 0), 1);
+  }
+
   /** The vertices that triangles have, and their triangles; those of skirts have vertices of their own. */
   function compact(triangles: Uint32Array): Grid {
     const number = new Int32Array(2 * n).fill(-1);
@@ -365,7 +372,8 @@ export function triangulate(chunk: Chunk, level: number): Grid {
       const [fx, fy] = [from[k]! % w, (from[k]! / w) | 0];
       const sigma = chunk.sigma[(fy >> 2) * Math.ceil(w / 4) + (fx >> 2)] ?? 0;
       pixel.set([x[k]! + OUTSIDE_PX + SKIRT * (twice & 1), y[k]! + OUTSIDE_PX, Math.round(code[k]!), 256 * sigma + viewsAt(chunk, fx, fy)], 4 * v);
-      at.set([((fx + 0.5) / w) * 65535, ((fy + 0.5) / h) * 65535], 2 * v);
+      const place = chunk.isWhole ? [x[k]!, y[k]!] : [fx, fy];
+      at.set(place.map((p, axis) => 65535 * within(p, axis)), 2 * v);
     });
     return { pixel, at, index: used.length <= 65535 ? Uint16Array.from(index) : index };
   }
