@@ -13,9 +13,10 @@ J       JSON: ``seq``, ``layer``, ``time_unix_s``; ``size`` w, h of the layer's 
 ======  =======================================================================
 
 Mask, depth, colour and the small image of the whole keyframe (empty where there is none) are the
-bytes of docs/wire.md, as they are stored; sigma and views are their codes under zlib in place of JPEG-LS, which browsers do not decode. Depth stays in the camera's
-frame, so a correction is a new matrix and scale. JSON texts have a ``type``: ``repose``, ``track``,
-``state``, ``site`` (where this scan and those tied to it are shown), and once a second ``link``.
+bytes of docs/wire.md, as they are stored; sigma and views are their codes under zlib in place of
+JPEG-LS, which browsers do not decode. Depth stays in the camera's frame, so a correction is a new
+matrix and scale. JSON texts have a ``type``: ``repose``, ``track``, ``state``, ``site`` (where this
+scan and those tied to it are shown), and once a second ``link``.
 """
 
 from __future__ import annotations
