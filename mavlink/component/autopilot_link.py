@@ -185,8 +185,7 @@ class _Want:
     number: int
     hz: float
     heard: int = 0
-    futile: int = 0
-    wait: int = 0
+    futile: int = 0  # checks in a row at which it had not come at all
 
 
 class RateKeeper:
@@ -206,7 +205,7 @@ class RateKeeper:
         """Request everything again at the next check, as after a reboot."""
         self._looked_ns = None
         for want in self._wants.values():
-            want.heard = want.futile = want.wait = 0
+            want.heard = want.futile = 0
 
     def tick(self, system: int, component: int, now_ns: int) -> list[Any]:
         """COMMAND_LONGs that request slow messages; empty between checks."""
@@ -228,7 +227,4 @@ class RateKeeper:
             want.futile = 0
             return False
         want.futile = 0 if heard else want.futile + 1
-        if want.futile <= PATIENCE:
-            return True
-        want.wait = (want.wait + 1) % RARELY
-        return want.wait == 0
+        return want.futile <= PATIENCE or want.futile % RARELY == 0

@@ -14,7 +14,6 @@ and has nothing open; one writes deliverables, and one aligns finished scans
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import queue
 import resource
@@ -63,8 +62,6 @@ STRANGER_S = 1.0
 """A drone without any scan is replaced by another after so long without a message."""
 REFUSAL_S = 60.0
 """Interval between two warnings about a drone that is not received."""
-ASKED, END, LEFT = range(3)
-"""The order of writing: what is asked for, then what a former process left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,27 +93,23 @@ class Drone:
     def put_head(self, scan: str, payload: bytes) -> None:
         """A head; it takes the place of one of the same scan that waits."""
         with self._changed:
-            has_room = scan in self._heads or len(self._heads) < MAX_HEADS
-            if has_room:
+            if scan in self._heads or len(self._heads) < MAX_HEADS:
                 self._heads[scan] = payload
-            self._note(has_room)
+                self._changed.notify()
+            else:
+                self.dropped += 1
 
     def put(self, event: drone.Event) -> None:
         """Anything else; only what a drone sends may be too much, as the rest is of our own."""
         with self._changed:
-            size = 0
             if isinstance(event, drone.Item | drone.Radio):
                 size = len(event.data) + ITEM_BYTES
-            is_full = self._bytes + size > MAX_ITEM_BYTES or len(self._events) >= MAX_ITEMS
-            has_room = not size or not is_full
-            if has_room:
+                if self._bytes + size > MAX_ITEM_BYTES or len(self._events) >= MAX_ITEMS:
+                    self.dropped += 1
+                    return
                 self._bytes += size
-                self._events.append(event)
-            self._note(has_room)
-
-    def _note(self, has_room: bool) -> None:
-        self.dropped += not has_room
-        self._changed.notify()
+            self._events.append(event)
+            self._changed.notify()
 
     def take(self, timeout_s: float) -> tuple[dict[str, bytes], list[drone.Event]]:
         """Heads and events that wait; without any, those that arrive within the timeout."""
@@ -162,8 +155,8 @@ class Receiver:
         self._lock = threading.RLock()  # of the table of drones, and of the radio
         self._drones: dict[str, Drone] = {}  # the last begun last
         self._tunnel = TunnelIntake()
-        self._writes: queue.PriorityQueue[tuple[int, int, drone.Write, Drone | None]]
-        self._writes, self._serial = queue.PriorityQueue(), itertools.count()
+        self._writes: queue.Queue[tuple[drone.Write, Drone] | None] = queue.Queue()
+        self._left: list[Path] = []  # folders whose files a former process did not write
         self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
         self._dropped = 0
@@ -182,8 +175,7 @@ class Receiver:
                     front.close()
                 raise
             log.debug("%s", error)  # a station that only connects waits for its router
-        for folder in folders_due(store):
-            self._write(LEFT, drone.Write("", folder))
+        self._left = folders_due(store)
         self._running = [
             start("receiver", self._run),
             *(start(f"front {front.endpoint}", front.run) for front in fronts),
@@ -202,7 +194,7 @@ class Receiver:
                 for one in self._all:
                     one.worker.join()
                     guarded(f"scans of {one.scans.drone}", partial(self._end, one))
-                self._write(END, drone.Write("", Path()))
+                self._writes.put(None)
             worker.join()
         self._running = []
 
@@ -390,7 +382,7 @@ class Receiver:
             case drone.Put() | drone.Get():
                 self._send(one, effect)
             case drone.Write():
-                self._write(ASKED, effect, one)
+                self._writes.put((effect, one))
             case drone.Opened(scan):
                 self._opened(scan)
 
@@ -433,15 +425,19 @@ class Receiver:
             self._sites.put(folder)
         self._ended(folder)
 
-    def _write(self, turn: int, effect: drone.Write, one: Drone | None = None) -> None:
-        self._writes.put((turn, next(self._serial), effect, one))
-
     def _write_all(self, worker: Worker) -> None:
-        """Write deliverables until the end; what a former process left is then for the next."""
-        while (asked := self._writes.get())[0] != END:
-            turn, _, effect, one = asked
-            trouble, is_due = write_files(effect.folder, self._deliver, turn == LEFT)
-            if one is not None:
-                one.put(drone.Written(effect.scan, trouble, is_due))
+        """Write deliverables until the end: those asked for first, and between them what a former
+        process left, which at the end is for the next."""
+        while True:
+            try:
+                asked = self._writes.get(block=not self._left)
+            except queue.Empty:
+                write_files(self._left.pop(0), self._deliver, is_left=True)
+                continue
+            if asked is None:
+                return
+            effect, one = asked
+            trouble, is_due = write_files(effect.folder, self._deliver)
+            one.put(drone.Written(effect.scan, trouble, is_due))
             if effect.is_whole and not trouble:
                 self.end(effect.folder)
