@@ -56,7 +56,14 @@ class Resumption:
         """Remove the mark: no scan runs, or none need resume."""
         self.left = Left.NOTHING
         try:
-            self._path.unlink(missing_ok=True)
+            self._path.unlink()
+            folder = os.open(self._path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)  # or a power cut within seconds of a stop brings the mark back
+            finally:
+                os.close(folder)
+        except FileNotFoundError:
+            pass
         except OSError as error:
             log.warning("%s cannot be removed: %s", self._path, error.strerror)
 

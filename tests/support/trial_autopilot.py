@@ -32,6 +32,7 @@ class Autopilot(threading.Thread):
         self.boot_s = time.monotonic() - 1000.0
         self.texts: list[str] = []  # STATUSTEXT that came back
         self.asked: list[Any] = []  # messages to send once
+        self.accepted: list[int] = []  # commands that were acknowledged
         self.beats_s: list[
             float
         ] = []  # when the companion's heartbeats came, by the kernel's clock
@@ -69,6 +70,8 @@ class Autopilot(threading.Thread):
                 for message in link.parse_buffer(data) or []:
                     if message.get_type() == "STATUSTEXT":
                         self.texts.append(message.text)
+                    if message.get_type() == "COMMAND_ACK" and message.result == 0:
+                        self.accepted.append(message.command)
                     if (message.get_type(), message.get_srcComponent()) == ("HEARTBEAT", COMPANION):
                         seconds, nanoseconds = struct.unpack("@qq", stamp)
                         self.beats_s.append(seconds + 1e-9 * nanoseconds)

@@ -31,6 +31,7 @@ from service.daemon.resumption import MARK
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(7200 if WHOLE else 280)]
 
+START, STOP = 2500, 2501
 CUTS = 5 if WHOLE else 1
 SHUTDOWN, WITHOUT_THE_LOG = 0x8004587D, struct.pack("I", 2)
 """Of Linux' ext4: ``_IOR('X', 125, __u32)`` and ``EXT4_GOING_FLAGS_NOLOGFLUSH``."""
@@ -137,7 +138,7 @@ def test_a_power_cut_loses_nothing(disk: Disk, tmp_path: Path, record: Row) -> N
             with power_on() as service:
                 if k == 0:
                     service.until_up()
-                    autopilot.asked.append(command(2500))
+                    autopilot.asked.append(command(START))
                 service.until(lambda s=service: s.frames > 0, "frames")  # type: ignore[misc]
                 back_s.append(time.monotonic() - service.began_s)
                 if k % 2 == 0:
@@ -148,9 +149,9 @@ def test_a_power_cut_loses_nothing(disk: Disk, tmp_path: Path, record: Row) -> N
         with power_on() as service:
             service.until(lambda: service.frames > 0, "frames")
             back_s.append(time.monotonic() - service.began_s)
-            autopilot.asked.append(command(2501))
-            service.until(lambda: service.get()["state"] != "scanning", "stop")
-            aboard |= cut(service, disk)  # at once: the stop holds
+            autopilot.asked.append(command(STOP))
+            service.until(lambda: STOP in autopilot.accepted, "stop")
+            aboard |= cut(service, disk)
         with power_on() as service:
             service.until_up()
             for folder in scan_folders(scans):
