@@ -222,10 +222,11 @@ def _settle(view: I32, cost: F32, neighbours: I32, penalty: float, slot: I32) ->
 
 
 HUBER_LEVELS = 8.0
-ROUNDS = 5
+ROUNDS = 10
 MAX_SAMPLES = 300_000
-PULL = 0.004
-"""Weight of the prior gain 1 and offset 0 of each view, as a share of its observations."""
+UNCHANGED_LEVELS = 0.5
+"""Most images have the flight's exposure. One that differs by more pulls no harder towards it: few
+odd ones, as under a cloud, neither stay so nor make all others brighter or darker."""
 
 FADE_RINGS = 4
 """Rings of triangles on each side of a seam across which the views fade."""
@@ -237,8 +238,8 @@ def levels(found: TriangleViews, views: int) -> F32:
     """(views, 3, 2) gain and offset per channel (BGR) that make views agree where they overlap.
 
     Least squares over triangles that two views see, ``g_a I_a + o_a = g_b I_b + o_b``, with
-    Huber weights, a mean gain of 1 and offset of 0, and a light pull of each view to these;
-    a view alone keeps its colours.
+    Huber weights for the pairs, and for the prior gain 1 and offset 0 of each view; a view alone
+    keeps its colours.
     """
     a, b, colour_a, colour_b = _pairs(found)
     out = np.zeros((views, 3, 2), np.float32)
@@ -272,18 +273,25 @@ def _solve(a: I32, b: I32, colour_a: F64, colour_b: F64, views: int) -> F64:
     """(views, 2) gain and offset of one channel."""
     n = len(a)
     scale = 128.0  # so that gain and offset weigh alike
-    seen = np.bincount(np.concatenate([a, b]), minlength=views).astype(np.float64)
-    pull = np.repeat(PULL * np.maximum(seen, 1.0) * scale**2, 2)
-    # The mean gain is 1 and the mean offset 0, or noise would draw all of them to black.
-    mean = np.kron(seen / seen.sum(), np.eye(2))
-    fixed = 1e3 * n * scale**2 * (mean.T @ mean)
+    both, colours = np.concatenate([a, b]), np.concatenate([colour_a, colour_b])
+    seen, total, squares = (np.bincount(both, colours**k, minlength=views) for k in range(3))
+    # Of each view, (2, 2): what the squared change of its own colours follows from.
+    moments = np.array([[squares, scale * total], [scale * total, scale**2 * seen]])
+    moments += 1e-6 * scale**2 * np.maximum(seen, 1) * np.eye(2)[..., None]
     start = np.tile([1.0, 0.0], views)
-    x = start.copy()
+    x, trust = start.copy(), np.ones(views)
     for number in range(ROUNDS):
         limit = HUBER_LEVELS if number else np.inf  # the first round weighs all alike
         N = np.zeros((2 * views, 2 * views))
         _add_pairs(a, b, colour_a, colour_b, scale, x, limit, N)
-        x = np.linalg.solve(N + np.diag(pull) + fixed, pull * start + fixed @ start)
+        pull = sparse.block_diag((trust * moments).transpose(2, 0, 1)).toarray()
+        # The mean gain is 1 and the mean offset 0, or noise would draw all of them to black.
+        mean = np.kron(trust * seen / (trust * seen).sum(), np.eye(2))
+        fixed = 1e3 * n * scale**2 * (mean.T @ mean)
+        x = np.linalg.solve(N + pull + fixed, (pull + fixed) @ start)
+        change = (x - start).reshape(views, 2)
+        squared = np.einsum("vi,ijv,vj->v", change, moments, change) / np.maximum(seen, 1)
+        trust = np.minimum(1.0, UNCHANGED_LEVELS / np.maximum(np.sqrt(squared), 1e-9))
     return np.column_stack([x[::2], scale * x[1::2]])
 
 

@@ -239,6 +239,20 @@ def test_gains_and_offsets_are_found() -> None:
     np.testing.assert_array_equal(alone[..., 0], 1.0)
 
 
+def test_two_bright_images_of_ten_leave_the_others_as_they_are() -> None:
+    rng = np.random.default_rng(4)
+    true = rng.uniform(40.0, 150.0, (6000, 3))
+    gain = np.ones(10)
+    gain[[3, 7]] = 1.4
+    view = np.array([rng.permutation(10)[:3] for _ in range(len(true))])
+    found = rows(view.tolist(), [[3.0, 2.0, 1.0]] * len(true))
+    for k in range(3):
+        found.bgr[:, k] = true * gain[view[:, k], None] + rng.normal(0.0, 3.0, true.shape)
+    fixed = levels(found, 10).astype(np.float64)
+    shown = fixed[..., :1] * gain[:, None, None] * 100.0 + fixed[..., 1:]
+    assert np.abs(shown - 100.0).max() < 2.0
+
+
 def test_a_car_in_one_of_five_views_is_left_out() -> None:
     found = rows([[0, 1, 2, 3, 4]], [[5.0, 4.0, 3.0, 2.0, 1.0]])
     found.bgr[0, :5] = 100.0
