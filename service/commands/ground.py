@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -137,13 +138,15 @@ class GroundOptions:
             fleet_rights=has_keys and bool(listen),
         )  # fmt: skip
         name = member_name(Path(certificate)) if certificate else ""  # on its certificate
-        return ReceiverConfig(self.store, session, limits, name, self.sites)
+        return ReceiverConfig(self.store, session, limits, name)
 
 
 @with_options(GroundOptions)
 def ground(given: GroundOptions) -> None:
     """Receive scans from drones; end with Ctrl-C. Scans: STORE/drones/DRONE/SCAN."""
+    from service.ground import live_site
     from service.ground.receiver import Receiver
+    from service.ground.sites import Sites
     from service.init_system import Notifier
     from service.radio import GROUND, RadioLink
     from service.workers import Workers
@@ -152,14 +155,20 @@ def ground(given: GroundOptions) -> None:
     taken = _take_in(config.store, given.take or [])
     stop, workers = stop_by_signals(), Workers()
     page: Portal | None = None
+    sites, aligning = Sites(config.store, config.limits), []
 
     def ended(folder: Path) -> None:
+        if given.sites:
+            sites.put(folder)
         if page is not None:
             page.ended(folder)
 
     receiver = Receiver(config, workers, ended=ended)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in given.mavlink or []]
     receiver.start()
+    if given.sites:
+        align_live = partial(live_site.run, config.store)
+        aligning = [workers.start("sites", sites.run), workers.start("live site", align_live)]
     where = ", ".join((*config.session.listen, *config.session.connect))
     print(f"ground station at {where}, scans in {config.store}", file=sys.stderr, flush=True)
     for radio in radios:
@@ -168,7 +177,7 @@ def ground(given: GroundOptions) -> None:
         if given.portal is not None:
             page = _open_portal(given.portal, given, receiver, workers)
         for folder in taken:
-            receiver.end(folder)
+            ended(folder)
         notifier.ready()
         shown: dict[str, str] = {}
         shown_at = beat_at = 0.0
@@ -196,6 +205,8 @@ def ground(given: GroundOptions) -> None:
         for radio in radios:
             radio.close()
         receiver.close()
+        for worker in aligning:
+            worker.join()
         closing.join()
     if given.as_json:
         report = {"scans": entries, "dropped": receiver.dropped, "workers": workers.report()}

@@ -7,8 +7,7 @@ it. Everything may be killed at any time and started again.
 What a drone's messages ask for is decided in :mod:`service.ground.drone` and carried out here.
 Threads, all of the table of workers: one keeps the session; one takes each kind of message, and
 the replies to each request; each drone has one, so that none waits for another, until it is silent
-and has nothing open; one writes deliverables, and one aligns finished scans
-(:mod:`service.ground.sites`).
+and has nothing open; one writes deliverables.
 """
 
 from __future__ import annotations
@@ -30,9 +29,7 @@ import zenoh
 from service.errors import InputError, SkyreliefError
 from service.ground import drone
 from service.ground.front import behind_fronts
-from service.ground.live_site import run as run_live_site
 from service.ground.received import ReceivedScan, deliver, folders_due, write_files
-from service.ground.sites import Sites
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
@@ -72,7 +69,6 @@ class ReceiverConfig:
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
     limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)
     name: str = ""  # of this station; empty: made once and kept in the store
-    sites: bool = False  # align finished scans that show the same ground
 
 
 class Drone:
@@ -157,7 +153,6 @@ class Receiver:
         self._tunnel = TunnelIntake()
         self._writes: queue.Queue[tuple[drone.Write, Drone] | None] = queue.Queue()
         self._left: list[Path] = []  # folders whose files a former process did not write
-        self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
         self._dropped = 0
         self._refused_at = -1e9
@@ -165,7 +160,7 @@ class Receiver:
 
     def start(self) -> None:
         """Begin; returns when the endpoints are open. Raises OutsideError when they cannot."""
-        store, start = self._config.store, self.workers.start
+        start = self.workers.start
         self._session_config, fronts = behind_fronts(self._config.session)
         try:
             self._session = open_session(self._session_config)
@@ -175,15 +170,12 @@ class Receiver:
                     front.close()
                 raise
             log.debug("%s", error)  # a station that only connects waits for its router
-        self._left = folders_due(store)
+        self._left = folders_due(self._config.store)
         self._running = [
             start("receiver", self._run),
             *(start(f"front {front.endpoint}", front.run) for front in fronts),
             start("deliverables", self._write_all),
         ]
-        if self._config.sites:
-            self._running.append(start("sites", self._sites.run))
-            self._running.append(start("live site", partial(run_live_site, store)))
 
     def close(self) -> None:
         """End, and write the deliverables of what has changed."""
@@ -419,12 +411,6 @@ class Receiver:
         answered = partial(one.put, effect.answered)
         one.requests.append(self._take_from("replies", replies, answered))
 
-    def end(self, folder: Path) -> None:
-        """A scan is whole: it is aligned with those that show the same ground, if configured."""
-        if self._config.sites:
-            self._sites.put(folder)
-        self._ended(folder)
-
     def _write_all(self, worker: Worker) -> None:
         """Write deliverables until the end: those asked for first, and between them what a former
         process left, which at the end is for the next."""
@@ -440,4 +426,4 @@ class Receiver:
             trouble, is_due = write_files(effect.folder, self._deliver)
             one.put(drone.Written(effect.scan, trouble, is_due))
             if effect.is_whole and not trouble:
-                self.end(effect.folder)
+                self._ended(effect.folder)
