@@ -95,11 +95,12 @@ $(CORE): pyproject.toml constraints.txt hatch_build.py $(PAGE)
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
 	  { echo "skyrelief needs Python 3.10 to 3.13; say which with: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 2; }
 	@echo "installing skyrelief and some 40 packages into $(VENV): once, a minute or two"
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt -e '.[portal]' & \
-	  s=0; while kill -0 $$! 2>/dev/null; do sleep 1; s=$$((s + 1)); test ! -t 1 || { \
-	  n=$$(ls -d $(VENV)/lib/python*/site-packages/*.dist-info | wc -l); \
-	  printf '\r[%-40.40s] %s packages, %s s' "$$(printf '%*s' $$n '' | tr ' ' '=')" $$n $$s; }; \
+	@{ test -x $(BIN)/python || $(PYTHON) -m venv $(VENV); } && \
+	  $(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt -e '.[portal]' & \
+	  s=0; while kill -0 $$! 2>/dev/null; do sleep 1; s=$$((s + 1)); \
+	  n=$$(ls -d $(VENV)/lib/python*/site-packages/*.dist-info 2>/dev/null | wc -l); \
+	  if test -t 1; then printf '\r[%-40.40s] %s packages, %s s' "$$(printf '%*s' $$n '' | tr ' ' '=')" $$n $$s; \
+	  elif test $$((s % 3)) = 0; then echo "  $$n packages, $$s s"; fi; \
 	  done; test ! -t 1 || echo; wait $$!
 	@touch $(CORE)
 
