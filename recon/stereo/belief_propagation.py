@@ -127,7 +127,7 @@ def drop_unreliable(
 
 
 @njit(cache=True, nogil=True)
-def _round(px: Any, coarse: Any) -> None:  # pragma: no cover - compiled
+def _round(px: Any, coarse: Any) -> None:
     """Labels in ``1 / SPECKLE_STEP``, and UNKNOWN."""
     for v in range(px.shape[0]):
         for u in range(px.shape[1]):
@@ -136,7 +136,7 @@ def _round(px: Any, coarse: Any) -> None:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _forget(coarse: Any, px: Any, confidence: Any) -> None:  # pragma: no cover - compiled
+def _forget(coarse: Any, px: Any, confidence: Any) -> None:
     """NaN and no confidence where the label is UNKNOWN."""
     for v in range(px.shape[0]):
         for u in range(px.shape[1]):
@@ -197,9 +197,7 @@ def _labels(
 
 
 @njit(cache=True, nogil=True)
-def _move_window(
-    above: Any, least: Any, v: int, begin: int, sums: Any, low: Any
-) -> None:  # pragma: no cover - compiled
+def _move_window(above: Any, least: Any, v: int, begin: int, sums: Any, low: Any) -> None:
     """Sums (L, 2, cells) over the rows around ``v``, from those around ``v - 1``; rows before
     ``begin`` are not in them, rows beyond the image count as nothing."""
     height, _, labels, cells = above.shape
@@ -215,7 +213,7 @@ def _move_window(
 
 
 @njit(cache=True, nogil=True)
-def _slide(new: Any, old: Any, sums: Any) -> None:  # pragma: no cover - compiled
+def _slide(new: Any, old: Any, sums: Any) -> None:
     """Add a row of cells to sums (PAD + cells + PAD), and take one away."""
     out = sums[PAD : PAD + new.shape[0]]
     for i in range(new.shape[0]):
@@ -223,7 +221,7 @@ def _slide(new: Any, old: Any, sums: Any) -> None:  # pragma: no cover - compile
 
 
 @njit(cache=True, nogil=True)
-def _window(sums: Any, out: Any) -> None:  # pragma: no cover - compiled
+def _window(sums: Any, out: Any) -> None:
     """Sums over columns, of both parities (2, cells), from those over rows (2, PAD + cells + PAD).
 
     Of seven columns three are of the one parity and four of the other.
@@ -241,9 +239,7 @@ def _window(sums: Any, out: Any) -> None:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _window_costs(
-    sums: Any, width: int, min_disparity: int, box: Any, total: Any
-) -> None:  # pragma: no cover - compiled
+def _window_costs(sums: Any, width: int, min_disparity: int, box: Any, total: Any) -> None:
     """Summed cost (L, 2, cells) of a row, and its sum over the labels that each pixel sees."""
     labels = box.shape[0]
     total[:] = 0
@@ -313,7 +309,7 @@ def _best_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
 @njit(cache=True, nogil=True)
 def _best_labels(
     above: Any, ring: Any, v: int, parity: int, belief: Any, best: Any, label_of: Any, second: Any
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """:func:`_best_block` of one parity of a row."""
     _, _, labels, cells = above.shape
     data = above.ctypes.data + (2 * v + parity) * labels * cells
@@ -334,7 +330,7 @@ def _best_labels(
 @njit(cache=True, nogil=True)
 def _costs_around(
     label_of: Any, box: Any, parity: int, count: int, below: Any, here: Any, over: Any
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Of each winner the cost, and that of the labels below and above it, which an outermost label
     has not."""
     last = box.shape[0] - 1
@@ -350,7 +346,7 @@ def _place_winners(
     label_of: Any, best: Any, second: Any, below: Any, here: Any, over: Any, low: Any, total: Any,
     seen: Any, first: int, width: int, sure_lead: int, min_evidence: float, px: Any,
     confidence: Any,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
+) -> None:  # fmt: skip
     """Where between the labels the summed cost is least, an equiangular V, and how sure that is.
 
     The partner of label 0 of cell 0 is at column ``first``, of the next cell two further. Without a
@@ -383,7 +379,7 @@ def _select(
     begin: int, end: int, above: Any, least: Any, seen: Any, coarser: Any, edges: Any,
     iterations: int, ring: Any, min_disparity: int, sure_lead: int, min_evidence: float, px: Any,
     confidence: Any,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
+) -> None:  # fmt: skip
     """Labels of the rows, each as soon as its messages are done."""
     _, _, labels, cells = above.shape
     width = px.shape[1]
@@ -428,7 +424,7 @@ def _select(
 @njit(cache=True, nogil=True)
 def _check_visibility(
     px: Any, confidence: Any, min_disparity: int, tolerance: float, fill: bool
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """NaN, in place, where the right view would see a nearer surface (by ``tolerance`` labels).
 
     Only accepted labels (confidence above 0) hide others. With ``fill`` a hidden pixel takes
@@ -462,7 +458,7 @@ def _check_visibility(
 
 
 @njit(cache=True, nogil=True)
-def _mark_strips(row: Any, hidden: Any, tolerance: float) -> None:  # pragma: no cover - compiled
+def _mark_strips(row: Any, hidden: Any, tolerance: float) -> None:
     """Also hidden: an unknown strip left of a nearer surface, no wider than the step hides."""
     last = -1
     for u in range(row.shape[0]):
@@ -475,9 +471,7 @@ def _mark_strips(row: Any, hidden: Any, tolerance: float) -> None:  # pragma: no
 
 
 @njit(cache=True, nogil=True)
-def _fill_row(
-    row: Any, confidence: Any, hidden: Any, min_disparity: int
-) -> None:  # pragma: no cover - compiled
+def _fill_row(row: Any, confidence: Any, hidden: Any, min_disparity: int) -> None:
     """Give hidden pixels the farther of the nearest known labels to their left and right."""
     width = row.shape[0]
     known = np.float32(np.nan)

@@ -99,7 +99,7 @@ def window_fits(x: F32, radius: int, is_slanted: bool) -> Windows:
 def _find_surfaces(
     begin: int, end: int, x: F32, noise: F32, flat: Windows, slanted: Windows, places: F32,
     mixed: Bool,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
+) -> None:  # fmt: skip
     """Fill ``places`` (2, h, w) with those of the steadiest flat and slanted window of a pixel,
     -1 where it does not lie on the slanted one; set ``mixed`` to False where it lies on one."""
     width = x.shape[1]
@@ -118,7 +118,7 @@ def _find_surfaces(
 @njit(cache=True, nogil=True)
 def steadiest_windows(
     windows: Windows, radius: int, v: int, least: F32, expected: F32, place: F32
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """The steadiest of the windows that contain each pixel of a row: (w,) variance, value at the
     pixel, and place of that window, 0 to 8.
 
@@ -146,7 +146,7 @@ def steadiest_windows(
 @njit(cache=True, nogil=True)
 def plane_at(
     windows: Windows, radius: int, place: float, u: int, v: int
-) -> tuple[float, float, float]:  # pragma: no cover - compiled
+) -> tuple[float, float, float]:
     """Value at a pixel and slopes along columns and rows of the window at a place."""
     mean, across, down, _ = windows
     dv, du = radius * (int(place) // 3 - 1), radius * (int(place) % 3 - 1)
@@ -158,7 +158,7 @@ def plane_at(
 def _keep_spills(
     begin: int, end: int, x: F32, noise: F32, kept: Bool, bgr: U8, flat: Windows,
     slanted: Windows, places: F32, spilt: Bool,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
+) -> None:  # fmt: skip
     """Set ``spilt`` to False where a pixel's colour is that of its own surface."""
     for v in range(begin, end):
         for u in range(x.shape[1]):
@@ -173,7 +173,7 @@ def _keep_spills(
 def _is_spilt(
     u: int, v: int, plane: tuple[float, float, float], sigma: float, x: F32, noise: F32,
     kept: Bool, bgr: U8,
-) -> bool:  # fmt: skip  # pragma: no cover - compiled
+) -> bool:  # fmt: skip
     """True where the colours of the surface behind are like the pixel's, more than its own are."""
     expected, across, down = plane
     own = own_weight = other = other_weight = 0.0  # likelihoods of both surfaces, and weights

@@ -64,9 +64,7 @@ def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
 
 
 @njit(cache=True, nogil=True)
-def _fit(
-    left: Any, right: Any, partners: Any, step: int, every: int, solution: Any
-) -> None:  # pragma: no cover - compiled
+def _fit(left: Any, right: Any, partners: Any, step: int, every: int, solution: Any) -> None:
     """Coefficients of the terms (TERMS, 1), by reweighted least squares: towards the least sum of
     absolutes, then with Tukey's weights. Of the clear matches one of ``every`` counts."""
     rows, columns = partners.shape
@@ -116,7 +114,7 @@ def _fit(
 
 
 @njit(cache=True, nogil=True)
-def _join(parts: Any, words: Any) -> None:  # pragma: no cover - compiled
+def _join(parts: Any, words: Any) -> None:
     """Four bytes of each column as a word: (2, 5, cells) by parity to (w,)."""
     for u in range(words.shape[0]):
         word = np.uint32(0)
@@ -129,7 +127,7 @@ def _join(parts: Any, words: Any) -> None:  # pragma: no cover - compiled
 def _match(
     begin: int, end: int, left: Any, right: Any, width: int, step: int, labels: int,
     min_disparity: int, partners: Any,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
+) -> None:  # fmt: skip
     """Column in the right image of each sample's clear match; -1 without one."""
     here, there = np.empty(width, np.uint32), np.empty(width, np.uint32)
     parts = np.empty((2, 5, left.shape[2] - BORDER), np.uint8)
@@ -155,9 +153,7 @@ def _match(
 
 
 @njit(cache=True, nogil=True)
-def _apply(
-    begin: int, end: int, right: Any, change: Any, out: Any
-) -> None:  # pragma: no cover - compiled
+def _apply(begin: int, end: int, right: Any, change: Any, out: Any) -> None:
     """Add the change to each gray level."""
     height, width = right.shape
     one, half, most = np.float32(1), np.float32(0.5), np.float32(255)

@@ -173,7 +173,7 @@ def _census_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def census_row(apart: Any, v: int, row: Any, first: int) -> None:  # pragma: no cover - compiled
+def census_row(apart: Any, v: int, row: Any, first: int) -> None:
     """Census and gray levels of a row of :func:`columns_apart` (2, at least 5, any) uint8, from
     ``first`` on."""
     _, rows, step = apart.shape
@@ -258,7 +258,7 @@ def _cost_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
 def _cost_volume(
     begin: int, end: int, left: Any, right: Any, width: int, min_disparity: int, weights: Any,
     above: Any, least: Any,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
+) -> None:  # fmt: skip
     _, _, labels, cells = above.shape
     here, there = np.zeros((2, 6, 3 * cells), np.uint8), np.zeros((2, 6, 3 * cells), np.uint8)
     plane = 6 * 3 * cells

@@ -150,7 +150,7 @@ class Smoothness:
 
 
 @njit(cache=True, nogil=True)
-def _weights(image: Any, table: Any) -> Any:  # pragma: no cover - compiled
+def _weights(image: Any, table: Any) -> Any:
     height, width = image.shape
     weights = np.full((2, height, width), np.int16(FULL_WEIGHT), np.int16)
     for v in range(height):
@@ -164,7 +164,7 @@ def _weights(image: Any, table: Any) -> Any:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _coarser_weights(fine: Any) -> Any:  # pragma: no cover - compiled
+def _coarser_weights(fine: Any) -> Any:
     """Mean of the two edges that lie between two coarse pixels."""
     _, height, width = fine.shape
     coarse = np.empty((2, (height + 1) // 2, (width + 1) // 2), np.int16)
@@ -186,9 +186,7 @@ def edges_of(weights: I16, smoothness: Smoothness) -> I16:
 
 
 @njit(cache=True, nogil=True)
-def _edges(
-    weights: Any, cells: int, slope: int, truncation: int
-) -> Any:  # pragma: no cover - compiled
+def _edges(weights: Any, cells: int, slope: int, truncation: int) -> Any:
     _, height, width = weights.shape
     edges = np.zeros((2, 2, height + 2, 2, cells), np.int16)
     per_label, most = np.int32(slope), np.int32(truncation)
@@ -252,15 +250,13 @@ def ring_of(data: U8 | I16, iterations: int) -> U8:
 
 
 @njit(cache=True, nogil=True)
-def _blocks(width: int) -> int:  # pragma: no cover - compiled
+def _blocks(width: int) -> int:
     """Blocks of a row of cells that have pixels: all, or all but the last one."""
     return ((width + 1) // 2 + LANES - 1) // LANES
 
 
 @njit(cache=True, nogil=True)
-def _coarser(
-    begin: int, end: int, fine: Any, width: int, truncation: int, data: Any
-) -> None:  # pragma: no cover - compiled
+def _coarser(begin: int, end: int, fine: Any, width: int, truncation: int, data: Any) -> None:
     """Sum of the costs of 2x2 pixels, less its least, cut again to what can matter."""
     fine_height, _, labels, _ = fine.shape
     sums, low = np.empty((labels, width), np.int16), np.empty(width, np.int16)
@@ -322,9 +318,7 @@ def _interleave_code(context: Any, builder: Any, signature: Any, args: Any) -> A
 
 
 @njit(cache=True, nogil=True)
-def _start_row(
-    coarse: Any, v: int, height: int, width: int, ring: Any
-) -> None:  # pragma: no cover - compiled
+def _start_row(coarse: Any, v: int, height: int, width: int, ring: Any) -> None:
     """The messages that row ``v`` starts from: those of the coarser cells that it divides.
 
     Only the colour that the first sweep reads is filled; the sweep writes the other.
@@ -350,7 +344,7 @@ def _start_row(
 
 
 @njit(cache=True, nogil=True)
-def arriving_at(ring: Any, v: int, parity: int) -> Any:  # pragma: no cover - compiled
+def arriving_at(ring: Any, v: int, parity: int) -> Any:
     """Addresses of the messages from below, above, right and left to the first cell of a row."""
     _, rows, _, labels, cells = ring.shape
     row = labels * cells
@@ -367,7 +361,7 @@ def arriving_at(ring: Any, v: int, parity: int) -> Any:  # pragma: no cover - co
 @njit(cache=True, nogil=True)
 def _update_row(
     data: Any, ring: Any, v: int, colour: int, edges: Any, blocks: int, masks: Any, scratch: Any
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Messages that leave the pixels of one colour of row ``v``."""
     height, _, labels, cells = data.shape
     parity = (v + colour) & 1
@@ -404,7 +398,7 @@ def _update_row(
 
 
 @njit(cache=True, nogil=True)
-def masks_of(width: int, cells: int) -> Any:  # pragma: no cover - compiled
+def masks_of(width: int, cells: int) -> Any:
     """(2, cells) -1 where a cell of that parity is a pixel, else 0."""
     masks = np.zeros((2, cells), np.int16)
     masks[0, : (width + 1) // 2] = -1
@@ -416,7 +410,7 @@ def masks_of(width: int, cells: int) -> Any:  # pragma: no cover - compiled
 def advance(
     front: int, begin: int, end: int, data: Any, coarse: Any, edges: Any, width: int,
     iterations: int, masks: Any, scratch: Any, ring: Any,
-) -> int:  # fmt: skip  # pragma: no cover - compiled
+) -> int:  # fmt: skip
     """Start row ``front`` and give each row behind it its next iteration, so that the messages stay
     in the caches; the row that is done, with both its neighbours.
 
@@ -436,7 +430,7 @@ def advance(
 def _propagate(
     begin: int, end: int, data: Any, coarse: Any, edges: Any, width: int, iterations: int,
     ring: Any, out: Any,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
+) -> None:  # fmt: skip
     """Copy the rows that are done to ``out`` (4, h + 2, 2, L, cells), unless it is the ring."""
     _, _, labels, cells = data.shape
     masks, scratch = masks_of(width, cells), np.empty((labels + 1) * 4 * LANES, np.int16)

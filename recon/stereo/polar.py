@@ -351,7 +351,7 @@ def _reproject(
     plane: Any,
     depth_m: Any,
     sigma_m: Any,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     width = depth_m.shape[1]
     f, rows_per_rad, first, first_row, lowest, base, low, high, sigma_px = sampling
     for v in range(begin, end):

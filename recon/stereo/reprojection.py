@@ -61,7 +61,7 @@ def reproject(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def label_at(px: Any, x: Any, y: Any) -> Any:  # pragma: no cover - compiled
+def label_at(px: Any, x: Any, y: Any) -> Any:
     """Label at a place: bilinear where the four around it agree, else the nearest; or NaN."""
     height, width = px.shape
     i, j = int(np.rint(x)), int(np.rint(y))
@@ -93,7 +93,7 @@ def _reproject(
     sigma_px: float,
     depth_m: Any,
     sigma_m: Any,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     width = depth_m.shape[1]
     for v in range(begin, end):
         for u in range(width):
@@ -136,7 +136,7 @@ def carry(pair: PairDepth, K: F64, T_here_there: F64) -> PairDepth:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _slope(before: Any, here: Any, after: Any, sigma: Any) -> Any:  # pragma: no cover - compiled
+def _slope(before: Any, here: Any, after: Any, sigma: Any) -> Any:
     """Change of the inverse depth from pixel to pixel; 0 at an edge or next to nothing."""
     near = AGREES_SIGMAS * sigma / here
     if abs(here / before - 1.0) < near and abs(here / after - 1.0) < near:
@@ -145,9 +145,7 @@ def _slope(before: Any, here: Any, after: Any, sigma: Any) -> Any:  # pragma: no
 
 
 @njit(cache=True, nogil=True)
-def _carry(
-    depth: Any, sigma: Any, K: Any, T: Any, out_depth: Any, out_sigma: Any
-) -> None:  # pragma: no cover - compiled
+def _carry(depth: Any, sigma: Any, K: Any, T: Any, out_depth: Any, out_sigma: Any) -> None:
     height, width = depth.shape
     for v in range(height):
         for u in range(width):
@@ -178,9 +176,7 @@ def _carry(
 
 
 @njit(cache=True, nogil=True)
-def _close_gaps(
-    depth: Any, sigma: Any, out_depth: Any, out_sigma: Any
-) -> None:  # pragma: no cover - compiled
+def _close_gaps(depth: Any, sigma: Any, out_depth: Any, out_sigma: Any) -> None:
     height, width = depth.shape
     for v in range(1, height - 1):
         for u in range(1, width - 1):
@@ -289,9 +285,7 @@ def _fused(
 
 
 @njit(cache=True, nogil=True)
-def _largest_group(
-    inverse: Any, sigma: Any, count: int, agree_sigmas: float
-) -> int:  # pragma: no cover - compiled
+def _largest_group(inverse: Any, sigma: Any, count: int, agree_sigmas: float) -> int:
     """The reading that most others agree with; ties go to the smaller sigma."""
     best, most = 0, -1
     square = agree_sigmas * agree_sigmas
@@ -318,7 +312,7 @@ def _fuse(
     out_depth: Any,
     out_sigma: Any,
     out_views: Any,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     P, _, width = depth.shape
     square = agree_sigmas * agree_sigmas
     for v in range(begin, end):

@@ -113,9 +113,7 @@ def _taps(coarse: DisparityMap, guide: U8, scale: float) -> F32:
 
 
 @njit(cache=True, nogil=True)
-def _fill_taps(
-    px: Any, confidence: Any, colour: Any, scale: float, taps: Any
-) -> None:  # pragma: no cover - compiled
+def _fill_taps(px: Any, confidence: Any, colour: Any, scale: float, taps: Any) -> None:
     for v in range(px.shape[0]):
         for u in range(px.shape[1]):
             known = not np.isnan(px[v, u])
@@ -164,7 +162,7 @@ def _as_bits(typingctx: Any, value: Any) -> Any:
 
 
 @njit(inline="always")
-def _exp2(e: Any) -> Any:  # pragma: no cover - compiled
+def _exp2(e: Any) -> Any:
     """2 to the power e for -126 <= e <= 0, relative error below 8e-5; no branch, no table."""
     shifted = e + np.float32(12582912.0)  # 1.5 * 2**23 leaves the rounded e in the low bits
     f = e - (shifted - np.float32(12582912.0))
@@ -175,9 +173,7 @@ def _exp2(e: Any) -> Any:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
-def _add_taps(
-    tap: Any, near: Any, spatial: Any, colours: Any, totals: Any
-) -> None:  # pragma: no cover - compiled
+def _add_taps(tap: Any, near: Any, spatial: Any, colours: Any, totals: Any) -> None:
     """Add GROUP neighbouring taps of one coarse row to the sums of some runs of fine pixels.
 
     Flat arrays and constant offsets, so that the compiler sees that nothing overlaps.
@@ -207,7 +203,7 @@ def _add_taps(
 
 
 @njit(cache=True, nogil=True)
-def _aligned(size: int) -> Any:  # pragma: no cover - compiled
+def _aligned(size: int) -> Any:
     """``size`` float32 that start on a cache line: a load across two lines takes twice as long."""
     memory = np.empty(size + 16, np.float32)
     start = (-memory.ctypes.data % 64) // 4
@@ -215,7 +211,7 @@ def _aligned(size: int) -> Any:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _spread(row: Any, index: Any, tap: Any) -> None:  # pragma: no cover - compiled
+def _spread(row: Any, index: Any, tap: Any) -> None:
     """Lay the taps of one coarse row next to each fine pixel: (group, [tap, channel, pixel])."""
     for k in range(index.shape[0]):
         column = index[k]
@@ -228,9 +224,7 @@ def _spread(row: Any, index: Any, tap: Any) -> None:  # pragma: no cover - compi
 
 
 @njit(cache=True, nogil=True)
-def _columns(
-    base: Any, spatial: Any, first: int, width: int, index: Any, near: Any
-) -> None:  # pragma: no cover - compiled
+def _columns(base: Any, spatial: Any, first: int, width: int, index: Any, near: Any) -> None:
     """Coarse column of each (tap, pixel) of a tile, and log2 of its spatial weight."""
     for k in range(index.shape[0]):
         for x in range(TILE):
@@ -242,7 +236,7 @@ def _columns(
 
 
 @njit(cache=True, nogil=True)
-def _load_colour(guide: Any, scale: Any, colour: Any) -> None:  # pragma: no cover - compiled
+def _load_colour(guide: Any, scale: Any, colour: Any) -> None:
     """The scaled colours of a run of fine pixels: (channel, pixel), flat."""
     for x in range(guide.shape[0]):
         for channel in range(3):
@@ -250,7 +244,7 @@ def _load_colour(guide: Any, scale: Any, colour: Any) -> None:  # pragma: no cov
 
 
 @njit(cache=True, nogil=True)
-def _finish(sums: Any, support: Any, out: Any, sure: Any) -> None:  # pragma: no cover - compiled
+def _finish(sums: Any, support: Any, out: Any, sure: Any) -> None:
     """Eq. 2's division by K_p for one run of fine pixels."""
     for x in range(out.shape[0]):
         everything, weight = sums[x], sums[2 * TILE + x]
@@ -273,7 +267,7 @@ def _bilateral(
     min_support: float,
     out: Any,
     sure: Any,
-) -> None:  # pragma: no cover - compiled
+) -> None:
     """Tiles of fine columns in parallel; each goes down the rows with its spread taps at hand."""
     h = taps.shape[0]
     height, width = out.shape

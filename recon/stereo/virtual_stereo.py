@@ -230,9 +230,7 @@ def drop_unseen(labels: DisparityMap, pair: RectifiedPair) -> DisparityMap:
 
 
 @njit(cache=True, nogil=True)
-def _drop_unseen(
-    left_seen: Any, right_seen: Any, px: Any, confidence: Any
-) -> None:  # pragma: no cover - compiled
+def _drop_unseen(left_seen: Any, right_seen: Any, px: Any, confidence: Any) -> None:
     height, width = px.shape
     for v in range(height):
         for u in range(width):
