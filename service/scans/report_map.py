@@ -5,12 +5,12 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 import numpy as np
 
+from recon.surface.raster import Grid
 from recon.types import F64
 from service.scans.coverage import BEST, GAP, SELDOM, UNSURE, Coverage
 from service.scans.drawing import round_length
@@ -25,22 +25,6 @@ TEXT_PX = 22
 TRACK, LOOP, WAITING = "#20252b", "#1a5fd0", "#d08a1a"
 
 
-@dataclass(frozen=True, slots=True)
-class _View:
-    """Metres east and north to pixels."""
-
-    west_m: float
-    north_m: float
-    px_per_m: float
-    size_px: tuple[int, int]
-
-    def at(self, xy_m: F64) -> F64:
-        """(N, 2) pixels of (N, 2) metres."""
-        x = (xy_m[:, 0] - self.west_m) * self.px_per_m
-        y = (self.north_m - xy_m[:, 1]) * self.px_per_m
-        return np.column_stack([x, y])
-
-
 def map_figure(
     summary: dict[str, Any], poses: Sequence[PoseRecord], coverage: Coverage | None
 ) -> str:
@@ -52,18 +36,19 @@ def map_figure(
     track = np.array([p.T_world_camera[:2, 3] for p in poses]).reshape(-1, 2)
     grown = 1
     if len(track):
-        parts.append(_polyline(view.at(track), TRACK))
+        parts.append(_polyline(_px(view, track), TRACK))
         ellipses, grown = _ellipses(poses, view)
         parts += ellipses
         parts += _loops(summary, poses, view)
     parts += _survey(summary, view)
     parts.append(_scale_bar(view))
-    w, h = view.size_px
+    h, w = view.shape
     svg = f'<svg viewBox="0 0 {w} {h}" width="{w}" height="{h}">{"".join(parts)}</svg>'
     return f"<figure>{svg}<figcaption>{_caption(coverage, summary, grown)}</figcaption></figure>"
 
 
-def _view(poses: Sequence[PoseRecord], coverage: Coverage | None) -> _View:
+def _view(poses: Sequence[PoseRecord], coverage: Coverage | None) -> Grid:
+    """The map's pixels, as cells of the ground."""
     spots = [p.T_world_camera[:2, 3] for p in poses]
     if coverage is not None:
         west, south, east, north = coverage.bounds_m
@@ -71,14 +56,19 @@ def _view(poses: Sequence[PoseRecord], coverage: Coverage | None) -> _View:
     low, high = np.min(spots, axis=0), np.max(spots, axis=0)
     margin = 0.02 * float(np.max(high - low)) + 1.0
     span = high - low + 2 * margin
-    scale = min(WIDTH_PX / span[0], LARGEST_HEIGHT_PX / span[1])
-    size = (math.ceil(span[0] * scale), math.ceil(span[1] * scale))
-    return _View(float(low[0] - margin), float(high[1] + margin), float(scale), size)
+    scale = float(min(WIDTH_PX / span[0], LARGEST_HEIGHT_PX / span[1]))
+    shape = math.ceil(span[1] * scale), math.ceil(span[0] * scale)
+    return Grid(float(low[0] - margin), float(high[1] + margin), 1.0 / scale, shape)
 
 
-def _ground(coverage: Coverage, view: _View) -> str:
+def _px(view: Grid, xy_m: F64) -> F64:
+    """(N, 2) places in the SVG, whose pixels begin at whole numbers, of (N, 2) metres."""
+    return view.pixels(xy_m) + 0.5
+
+
+def _ground(coverage: Coverage, view: Grid) -> str:
     west, south, east, north = coverage.bounds_m
-    (x, y), (x1, y1) = view.at(np.array([[west, north], [east, south]]))
+    (x, y), (x1, y1) = _px(view, np.array([[west, north], [east, south]]))
     code = base64.b64encode(coverage.png_bytes()).decode("ascii")
     return (
         f'<image x="{x:.1f}" y="{y:.1f}" width="{x1 - x:.1f}" height="{y1 - y:.1f}" '
@@ -93,21 +83,19 @@ def _polyline(px: F64, colour: str) -> str:
     return f'<polyline fill="none" stroke="{colour}" stroke-width="1.2" points="{points}"/>'
 
 
-def _ellipses(poses: Sequence[PoseRecord], view: _View) -> tuple[list[str], int]:
+def _ellipses(poses: Sequence[PoseRecord], view: Grid) -> tuple[list[str], int]:
     """Ellipses of the horizontal position at some keyframes, and their enlargement."""
     keys = [p for p in poses if p.keyframe_seq is not None] or list(poses)
     keys = keys[:: max(1, -(-len(keys) // MAX_ELLIPSES))]
     shapes = [np.linalg.eigh(p.position_covariance[:2, :2]) for p in keys]
     usual = SIGMAS * float(np.median([np.sqrt(max(v[1], 0.0)) for v, _ in shapes]))
     grown = 1
-    while usual > 0 and usual * grown * view.px_per_m < SMALLEST_ELLIPSE_PX and grown < 1000:
+    while usual > 0 and usual * grown / view.cell_m < SMALLEST_ELLIPSE_PX and grown < 1000:
         grown *= 10
     out = []
     for pose, (values, axes) in zip(keys, shapes, strict=True):
-        x, y = view.at(pose.T_world_camera[None, :2, 3])[0]
-        small, large = (
-            SIGMAS * float(np.sqrt(max(v, 0.0))) * grown * view.px_per_m for v in values
-        )
+        x, y = _px(view, pose.T_world_camera[None, :2, 3])[0]
+        small, large = (SIGMAS * float(np.sqrt(max(v, 0.0))) * grown / view.cell_m for v in values)
         turn = -math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
         out.append(
             f'<ellipse cx="{x:.1f}" cy="{y:.1f}" rx="{min(large, 400):.1f}" '
@@ -117,13 +105,13 @@ def _ellipses(poses: Sequence[PoseRecord], view: _View) -> tuple[list[str], int]
     return out, grown
 
 
-def _loops(summary: dict[str, Any], poses: Sequence[PoseRecord], view: _View) -> list[str]:
+def _loops(summary: dict[str, Any], poses: Sequence[PoseRecord], view: Grid) -> list[str]:
     """Lines between the ends of loops; dashed where unused."""
     where = {p.keyframe_seq: p.T_world_camera[:2, 3] for p in poses if p.keyframe_seq is not None}
     out = []
     for a, b, used in loop_pairs(summary):
         if a in where and b in where:
-            (x, y), (x1, y1) = view.at(np.array([where[a], where[b]]))
+            (x, y), (x1, y1) = _px(view, np.array([where[a], where[b]]))
             look = f'stroke="{LOOP}"' if used else f'stroke="{WAITING}" stroke-dasharray="4 3"'
             out.append(
                 f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" '
@@ -140,14 +128,14 @@ def loop_pairs(summary: dict[str, Any]) -> list[tuple[int, int, bool]]:
     return [(int(a), int(b), bool(used)) for a, b, used in pairs or []]
 
 
-def _survey(summary: dict[str, Any], view: _View) -> list[str]:
+def _survey(summary: dict[str, Any], view: Grid) -> list[str]:
     """Triangles for control, circles for checks, red where refused."""
     out = []
     for p in (summary.get("refinement") or {}).get("points", []):
         if p.get("place_m") is None:
             continue
-        x, y = view.at(np.array([p["place_m"][:2]]))[0]
-        if not (0 <= x <= view.size_px[0] and 0 <= y <= view.size_px[1]):
+        x, y = _px(view, np.array([p["place_m"][:2]]))[0]
+        if not (0 <= x <= view.shape[1] and 0 <= y <= view.shape[0]):
             continue
         colour = "#d03030" if p["refused"] else "#fff"
         shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5"'
@@ -161,10 +149,10 @@ def _survey(summary: dict[str, Any], view: _View) -> list[str]:
     return out
 
 
-def _scale_bar(view: _View) -> str:
+def _scale_bar(view: Grid) -> str:
     """A bar of round length, and north."""
-    length_m = round_length(0.2 * view.size_px[0] / view.px_per_m)
-    length, y, x = length_m * view.px_per_m, view.size_px[1] - 12, view.size_px[0] - 24
+    length_m = round_length(0.2 * view.shape[1] * view.cell_m)
+    length, y, x = length_m / view.cell_m, view.shape[0] - 12, view.shape[1] - 24
     text = f'<text style="font-size:{TEXT_PX}px"'
     return (
         f'<path d="M12 {y - 8}v8h{length:.1f}v-8M{x} 58v-46m-8 14l8 -14l8 14" fill="none" '
