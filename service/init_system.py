@@ -7,6 +7,7 @@ record is lines of ``NAME=value``; values of several lines are preceded by their
 from __future__ import annotations
 
 import logging
+import logging.handlers
 import os
 import socket
 import struct
@@ -70,24 +71,17 @@ PRIORITIES = (
 MAX_BYTES = 100_000
 
 
-class JournalHandler(logging.Handler):
+class JournalHandler(logging.handlers.DatagramHandler):
     """Sends every record to the journal; rejected ones go to standard error."""
 
     def __init__(self, address: str = SOCKET) -> None:
-        super().__init__()
-        self._address = address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        super().__init__(address, None)
 
-    def emit(self, record: logging.LogRecord) -> None:
-        text = self.format(record)
-        try:
-            self._socket.sendto(packed(record, text), self._address)
-        except OSError:
-            print(f"{record.levelname} {record.name}: {text}", file=sys.stderr)
+    def makePickle(self, record: logging.LogRecord) -> bytes:
+        return packed(record, self.format(record))
 
-    def close(self) -> None:
-        self._socket.close()
-        super().close()
+    def handleError(self, record: logging.LogRecord) -> None:
+        print(f"{record.levelname} {record.name}: {self.format(record)}", file=sys.stderr)
 
 
 def packed(record: logging.LogRecord, text: str) -> bytes:

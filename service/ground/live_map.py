@@ -41,14 +41,6 @@ State = tuple[int, int]
 """Of a keyframe, as :meth:`ScanStore.states` gives it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cells:
-    """Content of a tile and its margin."""
-
-    height_m: F32  # (WIDE, WIDE) AMSL, NaN where unknown
-    rgb: U8  # (WIDE, WIDE, 3)
-
-
 def mercator(lat_deg: F64, lon_deg: F64) -> F64:
     """(N, 2) places in the square of Web Mercator: 0 to 1 from west and from north."""
     y = np.arcsinh(np.tan(np.radians(lat_deg))) / np.pi
@@ -131,8 +123,8 @@ class LiveMap:
             if time.monotonic() > until:
                 return
 
-    def cells(self, tile: Tile) -> Cells:
-        """The known part of a tile at a zoom up to :attr:`zoom`."""
+    def surface(self, tile: Tile) -> Raster:
+        """The known part of a tile, (WIDE, WIDE) with its margin, at a zoom up to :attr:`zoom`."""
         drawn = self._tiles.pop(tile, None) or _Drawn()
         now = dict(self._within(tile))
         if any(now.get(seq) != state for seq, state in drawn.states.items()):
@@ -149,8 +141,7 @@ class LiveMap:
             grid, drawn.height.reshape(shape), drawn.sigma.reshape(shape),
             drawn.rgb.reshape(*shape, 3),
         )  # fmt: skip
-        closed = fill_holes(raster, HOLE_PX)
-        return Cells(closed.height_m, closed.rgb)
+        return fill_holes(raster, HOLE_PX)
 
     def _within(self, tile: Tile) -> list[tuple[int, State]]:
         """Keyframes whose points may lie in a tile or its margin, with their states."""

@@ -18,7 +18,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from recon.surface.raster import hillshade
+from recon.surface.raster import Grid, Raster, hillshade
 from recon.types import F32, U8
 from service.errors import InputError, MissingError
 from service.ground.basemap import Basemap, tile_of, tile_px
@@ -28,7 +28,6 @@ from service.ground.live_map import (
     MAX_ZOOM,
     SIDE,
     WIDE,
-    Cells,
     LiveMap,
     Tile,
     degrees,
@@ -128,7 +127,7 @@ def tile_image(state: PortalState, folder: Path, layer: str, tile: Tile) -> U8:
     """(SIDE, SIDE, 4) BGRA of one tile."""
     raster = newer_raster(folder, layer)
     if raster is not None:
-        return _drawn(layer, _from_raster(raster, layer, tile), pixel_m(tile[0], _latitude(tile)))
+        return _drawn(layer, _from_raster(raster, layer, tile))
     if layer == "coverage":
         found = state.coverages.view(folder).found
         return _clear() if found is None else coverage_image(found, tile)
@@ -136,17 +135,12 @@ def tile_image(state: PortalState, folder: Path, layer: str, tile: Tile) -> U8:
         live = state.maps.view(folder)
         up = max(0, tile[0] - (tile[0] if live.zoom is None else live.zoom))
         parent = tile[0] - up, tile[1] >> up, tile[2] >> up
-        cells = live.cells(parent)
-    image = _drawn(layer, cells, pixel_m(parent[0], _latitude(tile)))
-    return _enlarged(image, tile, up, smooth=layer != TERRAIN)
+        surface = live.surface(parent)
+    return _enlarged(_drawn(layer, surface), tile, up, smooth=layer != TERRAIN)
 
 
 def _clear() -> U8:
     return np.zeros((SIDE, SIDE, 4), np.uint8)
-
-
-def _latitude(tile: Tile) -> float:
-    return degrees(0.5, (tile[2] + 0.5) / (1 << tile[0]))[0]
 
 
 def _enlarged(image: U8, tile: Tile, up: int, smooth: bool = True) -> U8:
@@ -173,7 +167,7 @@ def newer_raster(folder: Path, layer: str) -> Path | None:
         return None
 
 
-def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:
+def _from_raster(path: Path, layer: str, tile: Tile) -> Raster:
     from rasterio.enums import Resampling
     from rasterio.transform import from_origin
     from rasterio.vrt import WarpedVRT
@@ -194,24 +188,28 @@ def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:
         with WarpedVRT(image, **options) as warped:
             bands = warped.read()
         unknown = image.nodata
+    latitude, _ = degrees(0.5, (tile[2] + 0.5) / (1 << tile[0]))
+    grid = Grid(0.0, 0.0, pixel_m(tile[0], latitude), (WIDE, WIDE))
     if layer == "ortho":
-        height = np.where(bands[3] > 0, np.float32(0.0), np.float32(np.nan))
-        return Cells(height, np.ascontiguousarray(bands[:3].transpose(1, 2, 0)))
-    height = np.where(bands[0] == unknown, np.float32(np.nan), bands[0])
-    return Cells(height.astype(np.float32), np.zeros((WIDE, WIDE, 3), np.uint8))
+        height, rgb = np.where(bands[3] > 0, 0.0, np.nan), bands[:3].transpose(1, 2, 0)
+    else:
+        height = np.where(bands[0] == unknown, np.nan, bands[0])
+        rgb = np.zeros((WIDE, WIDE, 3), np.uint8)
+    no_sigma = np.full((WIDE, WIDE), np.nan, np.float32)
+    return Raster(grid, height.astype(np.float32), no_sigma, rgb)
 
 
-def _drawn(layer: str, cells: Cells, cell_m: float) -> U8:
-    """(SIDE, SIDE, 4) BGRA of a layer of the cells."""
+def _drawn(layer: str, surface: Raster) -> U8:
+    """(SIDE, SIDE, 4) BGRA of a layer, without the margin."""
     out = np.zeros((WIDE, WIDE, 4), np.uint8)
-    known = np.isfinite(cells.height_m)
+    known, cell_m = surface.known, surface.grid.cell_m
     if layer == "ortho":
-        out[..., :3] = cells.rgb[..., ::-1]
+        out[..., :3] = surface.rgb[..., ::-1]
         out[..., 3] = np.where(known, 255, 0)
     elif layer == TERRAIN:
-        out[...] = _terrarium(cells.height_m)
+        out[...] = _terrarium(surface.height_m)
     elif known.any():
-        height = _smooth(cells.height_m)
+        height = _smooth(surface.height_m)
         if layer == "dsm":
             out[..., :3] = np.nan_to_num(255.0 * hillshade(height, cell_m))[..., None]
             out[..., 3] = np.where(known, 255, 0)
