@@ -88,6 +88,7 @@ class VehicleHistory:
         """``wait`` is called with the seconds left (default: until a sample comes)."""
         self.config = config or HistoryConfig()
         self.vertical_datum = ""  # of its altitudes; empty: mean sea level
+        self.is_pressure_altitude = False  # they are those of air pressure in standard weather
         self._patience_s = patience_s
         self._lock = threading.Lock()
         self._news = threading.Condition()

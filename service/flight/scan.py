@@ -136,6 +136,7 @@ class Scan:
         self.rig = Rig(config.camera, config.scan, config.fusion)
         if inputs.history is not None:
             self.rig.vertical_datum = inputs.history.vertical_datum
+            self.rig.is_pressure_altitude = inputs.history.is_pressure_altitude
         self._velocity = VelocityIntegrator()
         self.recorder = Recorder(
             store,
@@ -341,8 +342,8 @@ class Scan:
 
     def _assumed(self) -> list[str]:
         """What was assumed in this scan: "lens", "distortion", "start" unless turns confirm it,
-        "view", "level", "height", "altitude", and with a narrow view "turn", as vision alone cannot
-        separate it from distance."""
+        "view", "level", "height", "altitude", with "pressure" where air pressure gave it, and with
+        a narrow view "turn", as vision alone cannot separate it from distance."""
         out = [w for w in self.inputs.assumed if w != "start" or not self.check.is_clock_sure]
         if self.attitudes == 0:
             out.append("view")
@@ -351,7 +352,7 @@ class Scan:
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
         if self.rig.is_altitude_assumed:
-            out.append("altitude")
+            out += ["altitude", "pressure"] if self.rig.is_pressure_altitude else ["altitude"]
         if self.inputs.camera.K[0, 0] > MAX_FOCAL * max(self.inputs.camera.size_px):
             out.append("turn")
         return out

@@ -31,6 +31,10 @@ MIN_LENS_SIGMA, MAX_LENS_SIGMA = 0.01, 0.1
 """Sigma of a focal length above which heights are in doubt, and above which the shape is; so, too,
 where positions and heights give scales that differ by more, as after a zoom."""
 
+PRESSURE_SIGMA_M = 70.0
+"""Of an altitude by the air pressure of the standard atmosphere, as DJI's drones without RTK state
+it: 8.4 m for each hPa of the weather, whose sigma is about 8 hPa."""
+
 MAX_NUMBER = 1e12
 """A larger figure in a summary is none: a peer's may be anything that JSON can be."""
 
@@ -143,8 +147,11 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         limits.append(_uncertain(focal))
     if "altitude" in assumed and georeference != BY_SURVEY:
         limits.append(
-            "the altitudes state no accuracy: all heights above sea level may be off by tens of "
-            "metres together"
+            "the altitudes are those of the air pressure in standard weather: all heights above "
+            f"sea level err by {PRESSURE_SIGMA_M:.0f} m together (1 sigma); give control points"
+            if "pressure" in assumed
+            else "the altitudes state no accuracy: all heights above sea level may be off by tens "
+            "of metres together"
         )
     lean_deg = _number(run, "lean_sigma_deg")
     if lean_deg is not None and lean_deg > MAX_LEAN_SIGMA_DEG:
@@ -235,27 +242,30 @@ MAX_POSES = 5000
 
 
 class SharedSigma:
-    """Sigma of the height that all points near a place share: of position, scale and lens."""
+    """Sigma of the height that points near a place share: of position, scale, lens and datum."""
 
-    def __init__(self, poses: Sequence[PoseRecord], share: float) -> None:
-        """``share`` of a depth is its sigma by scale and lens."""
+    def __init__(self, poses: Sequence[PoseRecord], share: float, datum_m: float = 0.0) -> None:
+        """``share`` of a depth is its sigma by scale and lens, ``datum_m`` that of all heights."""
         poses = poses[:: 1 + len(poses) // MAX_POSES]
         places = np.array([p.T_world_camera[:3, 3] for p in poses])
         from scipy.spatial import cKDTree  # a flight does without it
 
         self._near, self._up_m = cKDTree(places[:, :2]), places[:, 2]
         self._sigma_m = np.array([p.sigma_h_v_m[1] for p in poses])
-        self._share = share
+        self._share, self._datum_m = share, datum_m
 
     def absolute_m(self, own_m: F32, places_m: F32 | F64) -> F32:
         """(N,) sigma of the heights of (N, 3) ENU m whose own sigmas are (N,)."""
         at = self._near.query(places_m[:, :2])[1]
         by_depth = self._share * (self._up_m[at] - places_m[:, 2])
-        whole_m = np.sqrt(own_m**2 + self._sigma_m[at] ** 2 + by_depth**2)
+        whole_m = np.sqrt(own_m**2 + self._sigma_m[at] ** 2 + by_depth**2 + self._datum_m**2)
         return np.asarray(whole_m, np.float32)
 
 
 def shared_sigma(store: ScanStore) -> SharedSigma | None:
     """What the points of a scan share; None where it is not placed, or of unknown scale."""
-    share, poses = depth_share(store.summary or {}, store.header.georeference), main_track(store)
-    return None if share is None or not poses else SharedSigma(poses, share)
+    run, georeference = store.summary or {}, store.header.georeference
+    share, poses = depth_share(run, georeference), main_track(store)
+    by_pressure = "pressure" in _assumed(run) and georeference != BY_SURVEY
+    datum_m = PRESSURE_SIGMA_M if by_pressure else 0.0
+    return None if share is None or not poses else SharedSigma(poses, share, datum_m)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import random
 import re
@@ -21,9 +22,9 @@ from paths import DATA, SHARED
 from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry import quaternion
-from mavlink.telemetry.decode import READERS
+from mavlink.telemetry.decode import READERS, plausible_place
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, load_telemetry
+from mavlink.telemetry.logs import TelemetryLog, dataflash, load_telemetry, ulog
 from mavlink.telemetry.samples import F64
 from mavlink.wire.dialect import dialect
 
@@ -440,7 +441,7 @@ def test_subtitles_of_a_drone_without_a_position_give_its_height(tmp_path: Path)
     path = tmp_path / "flight.SRT"
     path.write_text("".join(cue(n, found if n > 2 else lost) for n in range(5)))
     log = load_telemetry(path)
-    assert log.warnings == ("3 cues without a position",)
+    assert log.warnings == ("3 cues without a position",) and log.history.is_pressure_altitude
     for time_ns in (0, 40_000_000, 100_000_000):  # the last between a cue without and one with
         state = log.history.state_at(time_ns)
         assert state is not None and state.lat_deg is None and state.alt_amsl_m is None
@@ -613,6 +614,30 @@ def test_damage_of_an_onboard_log_is_counted_in_one_line(
     assert 5000 <= damaged.counts["skipped_bytes"] <= 5100  # and what was torn
     assert damaged.warnings == (f"{damaged.counts['skipped_bytes']} damaged bytes were skipped",)
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_others_print_while_a_log_is_read_is_shown(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the readers of logs are silenced, not the process."""
+    path = tmp_path / "log.BIN"
+    path.write_bytes(dataflash_flight(True).data)
+
+    class Loud(io.BufferedReader):
+        def read(self, size: int | None = -1, /) -> bytes:
+            print("another thread")
+            return super().read(size)
+
+    def plausible(*place: float) -> bool:
+        print("another thread")
+        return plausible_place(*place)
+
+    monkeypatch.setattr(dataflash, "plausible_place", plausible)
+    load_telemetry(path)
+    assert "another thread" in capfd.readouterr().out
+    monkeypatch.setattr(ulog, "_LimitedFile", lambda path: Loud(io.FileIO(path)))
+    load_telemetry(shared("flight_logs/px4_auav_x21_68s.ulg"))
+    assert "another thread" in capfd.readouterr().out
 
 
 def test_a_damaged_time_of_an_onboard_log_costs_its_message_only(tmp_path: Path) -> None:

@@ -467,6 +467,19 @@ def test_an_altitude_above_the_ellipsoid_counts_where_no_other_is_there() -> Non
         assert at(log, 0.0).alt_amsl_m == pytest.approx(alt_m, abs=0.2)
 
 
+def test_a_recordings_altitudes_are_above_one_datum() -> None:
+    """Three of four sets state both heights or that above the ellipsoid, 47.5 m more."""
+    hae, amsl = {75: (16, False, (560.0 + 900) / 19_900)}, {15: LEVEL[15]}
+    place = {tag: value for tag, value in LEVEL.items() if tag != 15}
+    sets = [place | hae, place | amsl, place | hae | amsl, place | hae]
+    packets = [(n * 10**8, 0, local_set(values)) for n, values in enumerate(sets)]
+    log = klv.of_packets(HERE, packets, HistoryConfig())
+    assert log.history.vertical_datum == "ellipsoid"
+    altitudes = [at(log, 0.1 * n).alt_amsl_m for n in range(4)]
+    assert altitudes == pytest.approx([560.0] * 4, abs=0.2)
+    assert "1 positions are above another datum than the others': not used" in log.warnings
+
+
 def test_a_set_with_another_checksum_is_not_read() -> None:
     data = bytearray(local_set(LEVEL)) + b"\x01\x02\0\0"
     data[17:19] = struct.pack(">H", len(data) - 19)

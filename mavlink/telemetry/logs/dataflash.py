@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -105,14 +104,13 @@ TAIL_BYTES = 528
 
 @contextmanager
 def _unheard() -> Iterator[None]:
-    """Drop what pymavlink prints, and what its compiled indexer writes to stderr: a line for each
-    damaged byte."""
+    """Drop what the process writes to stderr: compiled code of pymavlink's indexer writes a line
+    for each damaged byte, and nothing else stops it."""
     stderr = os.dup(2)
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
     try:
-        with redirect_stdout(io.StringIO()):
-            yield
+        yield
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
@@ -120,11 +118,12 @@ def _unheard() -> Iterator[None]:
 
 def _messages(path: Path, counts: Counter[str]) -> Iterator[Any]:
     """The messages that are read; ``counts`` gets the bytes that belong to none."""
-    from pymavlink.DFReader import DFReader_binary  # type: ignore[import-untyped]
+    from pymavlink import DFReader  # type: ignore[import-untyped]
 
+    DFReader.print = lambda *_, **__: None  # it, too, prints a line for each damaged byte
     try:
         with _unheard():
-            log = DFReader_binary(str(path))
+            log = DFReader.DFReader_binary(str(path))
         whole = sum(log.counts[kind] * form.len for kind, form in log.formats.items())
         skipped = log.data_len - whole
         counts["skipped_bytes"] = skipped if skipped >= TAIL_BYTES else 0
@@ -133,8 +132,7 @@ def _messages(path: Path, counts: Counter[str]) -> Iterator[Any]:
     # Where the log is cut off, what was read before counts.
     with closing(log), suppress(Exception):
         while True:
-            with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-                message = log.recv_match(type=list(_Reader.TABLE))
+            message = log.recv_match(type=list(_Reader.TABLE))
             if message is None:
                 return
             yield message

@@ -3,10 +3,11 @@
 A set is a key of 16 bytes, a BER length, and items of key, length, value: of the local set a tag
 and an integer over the item's range, of the universal set 16 bytes and a float. Read are the
 sensor's place, the platform's attitude, the sensor's direction, and the slant range, which gives
-the height above the ground that it sees. An altitude above the ellipsoid counts where none is above
-mean sea level. A set may stand behind a header (synchronous metadata, MISB ST 1402) and behind sets
-that are not read. Of asynchronous metadata, whose packets have no time, the order in the file gives
-one; the sets' own time stamps space them evenly, and date the video.
+the height above the ground that it sees. Of altitudes above the ellipsoid and above mean sea level
+those count that most sets of the recording state. A set may stand behind a header (synchronous
+metadata, MISB ST 1402) and behind sets that are not read. Of asynchronous metadata, whose packets
+have no time, the order in the file gives one; the sets' own time stamps space them evenly, and date
+the video.
 """
 
 from __future__ import annotations
@@ -82,18 +83,21 @@ UNIVERSAL: dict[bytes, str] = {
 def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
     """The history in the packets of a metadata stream; ValueError where they give none."""
     history, counts, views = VehicleHistory(config), Counter[str](), list[float]()
-    track, warnings, heights = Track(), list[str](), Counter[str]()
-    for time_ns, _, data in packets:
-        counts["packets"] += 1
-        found = fields_of(data)
-        heights.update(found.keys() & {"alt", "hae"})
+    track, warnings = Track(), list[str]()
+    sets = [(time_ns, fields_of(data)) for time_ns, _, data in packets]
+    counts["packets"] = len(sets)
+    heights = Counter(name for _, found in sets for name in found.keys() & {"alt", "hae"})
+    height = max(("alt", "hae"), key=lambda name: heights[name])
+    if other := sum(height not in found and bool(found.keys() & heights) for _, found in sets):
+        warnings.append(f"{other} positions are above another datum than the others': not used")
+    for time_ns, found in sets:
         views += [found["hfov"]] if 0.0 < found.get("hfov", 0.0) < 180.0 else []
-        if samples := samples_of(found):
+        if samples := samples_of(found, height):
             own_ns = 1000 * round(found["time_us"]) if "time_us" in found else None
             track.add(time_ns, own_ns, samples)
             counts.update(type(sample).__name__ for sample in samples)
     start_ns = track.fill(history)
-    if heights["hae"] and not heights["alt"]:
+    if height == "hae":
         history.vertical_datum = ELLIPSOID
     return finish(
         path, history, counts, warnings, "video", may_lag=True,
@@ -183,13 +187,14 @@ def _local(key: bytes, value: bytes) -> tuple[str | None, float | None]:
     return name, low + (high - low) * number / (2**bits - 1)
 
 
-def samples_of(found: dict[str, float]) -> list[Sample]:
-    """The samples of vehicle and camera in the fields of one set."""
+def samples_of(found: dict[str, float], height: str = "") -> list[Sample]:
+    """The samples of vehicle and camera in the fields of one set; without a place where it has an
+    altitude and none of the ``height`` that is asked for."""
     out: list[Sample] = []
     lat, lon = found.get("lat", math.nan), found.get("lon", math.nan)
-    if plausible_place(lat, lon):
-        alt = found.get("alt", found.get("hae"))
-        out.append(PositionSample(None, lat, lon, alt, None, None))
+    is_other = height not in ("", *found) and bool(found.keys() & {"alt", "hae"})
+    if plausible_place(lat, lon) and not is_other:
+        out.append(PositionSample(None, lat, lon, found.get(height), None, None))
     head, down = None, 0.0  # down: of the optical axis
     body = from_degrees(*(found.get(name) for name in ("roll", "pitch", "heading")))
     on_body = from_degrees(*(found.get(name) for name in ("turned", "elevation", "azimuth")))

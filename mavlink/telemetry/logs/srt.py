@@ -102,6 +102,7 @@ def of_cues(path: Path, cues: Iterable[tuple[int, str]], config: HistoryConfig) 
         warnings.append(
             f"times begin again {counts['joined']} time(s): joined, the rest follows on"
         )
+    history.is_pressure_altitude = True
     focal = one_lens(focals, "mm (35 mm equivalent)", 0, warnings)
     return finish(path, history, counts, warnings, "video", focal_35mm=focal)
 

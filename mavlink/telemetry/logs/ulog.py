@@ -7,7 +7,6 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -129,17 +128,16 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
         if file.read(len(HEADER)) != HEADER:
             raise ValueError(f"{path}: not a PX4 .ulg log")
     try:
-        from pyulog import ULog  # type: ignore[import-untyped]
-        from pyulog.core import ULogException  # type: ignore[import-untyped]
+        from pyulog import core  # type: ignore[import-untyped]
     except ImportError as error:
         raise ValueError(
             f"{path}: reading .ulg needs pyulog; pip install 'skyrelief[logs]'"
         ) from error
+    core.print = lambda *_, **__: None  # a line for each damaged message
     try:
-        # pyulog prints a line for each damaged message.
-        with _LimitedFile(path) as file, redirect_stdout(io.StringIO()):
-            log = ULog(file, [*TABLE, "home_position"])
-    except (*BROKEN, ULogException) as error:
+        with _LimitedFile(path) as file:
+            log = core.ULog(file, [*TABLE, "home_position"])
+    except (*BROKEN, core.ULogException) as error:
         raise ValueError(f"{path}: the .ulg log cannot be read ({error})") from error
     topics = {d.name: d.data for d in log.data_list if d.multi_id == 0 and "timestamp" in d.data}
     counts = Counter({name: len(data["timestamp"]) for name, data in topics.items()})

@@ -277,7 +277,8 @@ def test_an_image_that_was_stored_on_its_side_is_turned_back(
     frames = list(source)
     assert source.size_px == (64, 48) and len(frames) == 4
     assert any("1 images are 48x64: turned to 64x48" in warning for warning in source.warnings)
-    rolls = [frame.geotag.ypr_deg[2] % 360 for frame in frames if frame.geotag]
+    tags = [frame.geotag for frame in frames]
+    rolls = [tag.ypr_deg[2] % 360 for tag in tags if tag and tag.ypr_deg]
     if orientation != 1:
         assert all(upper_left(frame.image) for frame in frames)
         assert rolls == [0.0] * 4

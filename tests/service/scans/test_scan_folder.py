@@ -103,6 +103,20 @@ def test_heights_in_the_world_are_as_sure_as_the_scale(tmp_path: Path, house: Ho
     assert summary["quality"]["sigma_absolute_median_m"] == pytest.approx(2.0, abs=0.1)
 
 
+def test_heights_by_air_pressure_are_as_sure_as_the_weather(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """At one place, over weeks, DJI's drones without RTK state heights that differ by 150 m."""
+    with house.flown(tmp_path) as store:
+        store.finish({"scale": {"sigma": 0.05}, "assumed": ["altitude", "pressure"]})
+        summary = write_deliverables(tmp_path, store, {})
+    assert np.median(laspy.read(tmp_path / CLOUD)["sigma_absolute_m"]) == pytest.approx(70.0, 0.01)
+    quality = summary["quality"]
+    assert quality["sigma_absolute_median_m"] == pytest.approx(70.0, 0.01)
+    assert quality["sigma_median_m"] < 0.06
+    assert any("err by 70 m together" in reason for reason in quality["trust"]["reasons"])
+
+
 def test_voxels_are_as_fine_as_the_pixels_on_the_ground(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
         summary = write_deliverables(tmp_path, store)

@@ -33,6 +33,8 @@ SURE: dict[str, Any] = {
         ({"assumed": ["turn"]}, "gnss", "doubtful", "narrower than 3 degrees"),
         ({"assumed": ["altitude"]}, "exif", "georeferenced", "above sea level"),
         ({"assumed": ["altitude"]}, BY_SURVEY, "georeferenced", ""),
+        ({"assumed": ["altitude", "pressure"]}, "exif", "georeferenced", "air pressure"),
+        ({"assumed": ["altitude", "pressure"]}, BY_SURVEY, "georeferenced", ""),
         ({"sigma_focal": 0.008}, "gnss", "georeferenced", ""),
         (
             {"sigma_focal": 0.04},
