@@ -271,6 +271,8 @@ def _altitude(gps: dict[int, Any], xmp: dict[str, str]) -> tuple[float | None, D
     altitude = finite_number(gps.get(6))
     if altitude is not None:
         below = gps.get(5) in (1, b"\x01", 3, b"\x03")
+        if getattr(gps[6], "numerator", 0) >= 1 << 31:  # below zero, as a Yuneec E10T writes it
+            altitude -= (1 << 32) / gps[6].denominator
         readings.append(Reading("EXIF", (-altitude if below else altitude,), _step(gps.get(6))))
     if (absolute := finite_number(text := xmp.get("AbsoluteAltitude", ""))) is not None:
         readings.append(Reading("XMP", (absolute,), _last_digit(text)))

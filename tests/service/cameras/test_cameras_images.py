@@ -555,6 +555,19 @@ def test_a_height_of_an_rtk_receiver_is_above_the_ellipsoid(tmp_path: Path) -> N
     assert datums == ["ellipsoid", ""]
 
 
+@pytest.mark.parametrize("below", [b"\0", b"\1"])
+def test_an_altitude_below_zero_in_an_unsigned_number_is_read(tmp_path: Path, below: bytes) -> None:
+    """As a Yuneec E10T writes -28.41 m; where the letter says below, too, it is above."""
+    gps = gps_tags(31.19, 120.93, 0.0, (12, 0, 0)) | {5: below, 6: IFDRational(77_777, 1000)}
+    path = tmp_path / "a.jpg"
+    write_still(path, gps=gps)
+    data, order = path.read_bytes(), "<" if b"Exif\0\0II" in path.read_bytes() else ">"
+    as_written = struct.pack(f"{order}LL", (1 << 32) - 28_410, 1000)
+    path.write_bytes(data.replace(struct.pack(f"{order}LL", 77_777, 1000), as_written))
+    tag = next(iter(open_camera(str(tmp_path)))).geotag
+    assert tag is not None and tag.alt_amsl_m == pytest.approx(28.41 if below == b"\1" else -28.41)
+
+
 def test_altitudes_of_two_datums_are_not_mixed(tmp_path: Path) -> None:
     """The receiver lost its corrections in one of three."""
     for i, kind in enumerate(("RtkAlt", "GpsFusionAlt", "RtkAlt")):
