@@ -97,13 +97,11 @@ def report_html(
     return f"{head}</title><style>{STYLE}</style><body>{body}</body></html>\n"
 
 
-def maps_of(
-    summary: dict[str, Any], poses: Sequence[PoseRecord], raster: Raster, is_shaded: bool = True
-) -> Maps:
+def maps_of(summary: dict[str, Any], poses: Sequence[PoseRecord], raster: Raster) -> Maps:
     """``raster``, in metres about the scan's origin, from above with the track of the poses."""
     track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
     zero_m = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
-    return draw_maps(raster, track, 1400, zero_m, is_shaded)
+    return draw_maps(raster, track, 1400, zero_m)
 
 
 def _map_pages(

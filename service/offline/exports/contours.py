@@ -19,7 +19,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame, geojson_of, line_geometry
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground
-from service.offline.exports.view import ExportOptions, ScanView, in_parts
+from service.offline.exports.view import ExportOptions, ScanView, in_parts, made_once
 from service.offline.geopackage import Columns, lines, points, write_layers
 from service.scans.annotations import Point, Spot, read_annotations
 from service.scans.fused_cloud import EVERYWHERE, Box
@@ -150,17 +150,14 @@ def _text(one: Contour) -> list[str]:
     return [*kind, "40", f"{TEXT_M:g}", "1", one.label, "50", f"{turn_deg:.1f}"]
 
 
+@made_once
 def contours_of(scan: ScanView, options: ExportOptions) -> list[Contour]:
     """The contours in UTM metres; InputError without a georeference.
 
     Where there are more points than one tile may have, lines end at the borders of tiles.
     """
     scan.needs_place("a contour map")
-
-    def found() -> list[Contour]:
-        return list(chain(*in_parts(scan, _contours, options, GROUND_MARGIN_M)))
-
-    return scan.shared(("contours", options), found)
+    return list(chain(*in_parts(scan, _contours, options, GROUND_MARGIN_M)))
 
 
 def _contours(scan: ScanView, options: ExportOptions, box: Box) -> list[Contour]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,12 +53,7 @@ class Recording:
     words: str  # for the operator
 
 
-def recording_of(
-    folder: Path,
-    header: ScanHeader,
-    opener: Callable[[str], CameraSource] = open_camera,
-    within: Path | None = None,
-) -> Recording:
+def recording_of(folder: Path, header: ScanHeader, within: Path | None = None) -> Recording:
     """The video or folder of stills that a scan was made from, when it still is where it was.
 
     ``scan.json`` names it (``run.source``). A relative path is tried from the working directory,
@@ -79,7 +74,7 @@ def recording_of(
     if found is None:
         return Recording(None, f"{stored}: {named} is not there; give the flight's --video")
     try:
-        camera, source = camera_of(header), opener(str(found))
+        camera, source = camera_of(header), open_camera(str(found))
         size_px = source.size_px
         source.close()
     except SkyreliefError as error:
@@ -126,13 +121,11 @@ def images_key(options: ExportOptions) -> tuple[Path | None, bool, int | None]:
     return video, options.stored, options.video_epoch_ns
 
 
-def opened(
-    header: ScanHeader, video: Path, opener: Callable[[str], CameraSource] = open_camera
-) -> CameraSource:
+def opened(header: ScanHeader, video: Path) -> CameraSource:
     """The open video; InputError when it is missing or its images have another size."""
     if not video.exists():
         raise InputError(f"{video}: no such file or folder; give the flight's video")
-    camera, source = camera_of(header), opener(str(video))
+    camera, source = camera_of(header), open_camera(str(video))
     if source.size_px != camera.size_px:
         source.close()
         raise InputError(
@@ -148,7 +141,6 @@ def frames_at(
     video: Path,
     epoch_ns: int | None,
     progress: Progress | None = None,
-    opener: Callable[[str], CameraSource] = open_camera,
 ) -> Iterator[tuple[int, U8]]:
     """Place of each time in ``times_ns`` (unix), and the frame of ``video`` taken then.
 
@@ -157,7 +149,7 @@ def frames_at(
     a frame are left out. Raises InputError when the video is of another size, or has no frame of
     these times.
     """
-    source = opened(header, video, opener)
+    source = opened(header, video)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
     say = (progress or Progress()).counting(len(times_ns))
     is_any = False
@@ -197,7 +189,6 @@ def video_images(
     video: Path,
     epoch_ns: int | None,
     progress: Progress | None = None,
-    opener: Callable[[str], CameraSource] = open_camera,
     max_bytes: int = 1_500_000_000,
 ) -> list[TextureView]:
     """A view per keyframe by :func:`frames_at`, without distortion; all of them together are no
@@ -210,7 +201,7 @@ def video_images(
     shrink = min(1.0, (max_bytes / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
     found: dict[int, TextureView] = {}
     times = [k.time_ns for k in keyframes]
-    for n, image in frames_at(times, header, video, epoch_ns, progress, opener):
+    for n, image in frames_at(times, header, video, epoch_ns, progress):
         bgra = _bgra(undistort.image(image), undistort.valid)
         whole = TextureView(bgra, camera.K, keyframes[n].depth.T_world_camera)
         found[n] = resized(whole, shrink)

@@ -21,7 +21,7 @@ from recon.surface.raster import Grid, Raster, round_cell
 from recon.surface.texture_views import TextureView
 from recon.types import Array
 from service.errors import InputError
-from service.georeference import LocalFrame, map_crs
+from service.georeference import map_crs
 from service.offline.exports.images import recording_for, shared_images
 from service.offline.exports.surface import bare_ground, cell_places, complete_model, surface_model
 from service.offline.exports.view import (
@@ -46,8 +46,8 @@ QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
 RAW = {"tiled": True, "sparse_ok": True, "bigtiff": "IF_SAFER"}
 GDAL_CACHE_BYTES = 128_000_000
 
-SOME_MAP, EARTH_RADIUS_M = "EPSG:32631", 6.371e6
-"""The first stands for the map of a scan without georeference, whose metres stay as they are."""
+SOME_MAP = "EPSG:32631"
+"""Stands for the map of a scan without georeference, whose metres stay as they are."""
 
 OBJECT_M = 1.0
 """Above the bare ground; seams of the orthophoto run around what is higher."""
@@ -83,8 +83,10 @@ def dsm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
         raster, origin = complete_model(scan, options.cell_m)
     absolute_m = np.full(raster.grid.shape, NODATA_M, np.float32)
     if scan.shared_sigma is not None:
-        own_m, places = raster.sigma_m[raster.known], cell_places(scan, raster)[raster.known]
-        absolute_m[raster.known] = scan.shared_sigma.absolute_m(own_m, places)
+        places = cell_places(scan, raster.grid, raster.height_m)[raster.known]
+        absolute_m[raster.known] = scan.shared_sigma.absolute_m(
+            raster.sigma_m[raster.known], places
+        )
     bands = np.stack([raster.height_m, raster.sigma_m, origin.astype(np.float32), absolute_m])
     image = np.where(raster.known, bands, NODATA_M).astype(np.float32)
     names = (f"height {scan.above(options)}, m", "sigma, m", "filled", "sigma in the world, m")
@@ -185,7 +187,7 @@ def _terrain(scan: ScanView, raster: Raster, views: Sequence[TextureView]) -> Te
     high = (above_m > OBJECT_M).astype(np.uint8)
     whole = cv2.morphologyEx(high, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     objects = np.asarray(cv2.connectedComponents(whole)[1], np.int32)
-    return Terrain(raster, cell_places(scan, raster), eyes, objects)
+    return Terrain(raster, cell_places(scan, raster.grid, raster.height_m), eyes, objects)
 
 
 def over(bounds: Box, cell_m: float) -> Grid:
@@ -259,25 +261,21 @@ def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
     Raises InputError when the scan contains no surface.
     """
-    from rasterio.warp import Resampling, reproject
-
     found = coverage_of(scan.store, options.cell_m)
     if found is None:
         raise InputError(f"{scan.folder} {NO_POINTS}")
     layer, grid = found.layer, found.layer.grid
-    origin = np.zeros((1, 3)) if scan.frame is None else scan.frame.to_geodetic(np.zeros((1, 3)))
-    height = layer.height_m + origin[0, 2]
-    bands = np.stack([layer.views.astype(np.float32), layer.sigma_m, height]).astype(np.float32)
+    zero_m = 0.0 if scan.frame is None else scan.frame.to_geodetic(np.zeros((1, 3)))[0, 2]
+    height_m = layer.height_m + zero_m
+    bands = np.stack([layer.views.astype(np.float32), layer.sigma_m, height_m]).astype(np.float32)
     bands[:, ~(layer.known | (layer.views > 0))] = np.nan
     if scan.frame is not None:
         grid = over(box_around(layer.grid.bounds, scan.frame.to_utm), layer.grid.cell_m)
-        transform, crs = enu_map(layer.grid, scan.frame)
-        bands, _ = reproject(
-            bands, np.full((len(bands), *grid.shape), np.nan, np.float32),
-            src_transform=transform, src_crs=crs, src_nodata=np.nan,
-            dst_transform=transform_of(grid), dst_crs=f"EPSG:{scan.frame.epsg}",
-            resampling=Resampling.nearest,
-        )  # fmt: skip
+        level = np.full(grid.shape, zero_m, np.float32)
+        xy_m = cell_places(scan, grid, level)[..., :2].reshape(-1, 2)
+        rows, cols = layer.grid.cells(xy_m)
+        bands = np.where(layer.grid.holds(xy_m), bands[:, rows, cols], np.nan)
+        bands = bands.reshape(-1, *grid.shape)
     bands = np.where(np.isfinite(bands), bands, np.float32(NODATA_M))
     names = ("views", "sigma, m", "height, m")
     layers = Layers(grid, bands, names, NODATA_M, options.to_datum)
@@ -285,24 +283,10 @@ def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
         put(image, layers)
 
 
-def transform_of(grid: Grid, scale: float = 1.0) -> Any:
-    """The transform of rasterio for a grid whose metres are ``scale`` of the map's."""
+def transform_of(grid: Grid) -> Any:
     from rasterio.transform import from_origin
 
-    west_m, north_m, cell_m = (scale * v for v in (grid.west_m, grid.north_m, grid.cell_m))
-    return from_origin(west_m, north_m, cell_m, cell_m)
-
-
-def enu_map(grid: Grid, frame: LocalFrame | None) -> tuple[Any, str]:
-    """Transform and coordinate system of a grid in ENU metres.
-
-    The orthographic map of the ellipsoid (EPSG method 9840) is ENU at height 0: lengths at the
-    origin's height are longer.
-    """
-    if frame is None:
-        return transform_of(grid), SOME_MAP
-    crs = f"+proj=ortho +lat_0={frame.lat_deg!r} +lon_0={frame.lon_deg!r} +datum=WGS84 +units=m"
-    return transform_of(grid, 1.0 / (1.0 + frame.alt_amsl_m / EARTH_RADIUS_M)), crs
+    return from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m)
 
 
 def warped(

@@ -9,11 +9,10 @@ import numpy as np
 
 from recon.surface.raster import Raster
 from service.errors import InputError
-from service.georeference import LocalFrame
-from service.offline.exports.rasters import NODATA_M, enu_map, open_map, over, warped
+from service.offline.exports.rasters import NODATA_M, SOME_MAP, open_map, over, transform_of, warped
 from service.offline.exports.view import ExportOptions, ScanView
-from service.offline.tiles import box_around
 from service.scans.coverage import coverage_of
+from service.scans.drawing import draw_maps
 from service.scans.folder import middle_stages, surface
 from service.scans.report import maps_of, report_html
 from service.scans.writing import SUMMARY, write_whole
@@ -31,13 +30,16 @@ def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
     folder, store = scan.folder, scan.store
     try:
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-        made = made_maps(folder, scan.flown_frame, summary["heights"])
+        made = made_maps(folder, summary["heights"])
         scan.progress("maps of the cloud; export ortho and dsm first" if made is None else "report")
         cloud, raster, coverage = scan.fused.cloud, surface(scan.fused), coverage_of(store)
         shown = middle_stages(folder, store)
-        maps = None
-        if seen := made or raster:  # an orthophoto has its own light
-            maps = maps_of(summary, scan.poses, seen, is_shaded=made is None)
+        maps = None if raster is None else maps_of(summary, scan.poses, raster)
+        if made is not None:  # an orthophoto has its own light
+            track_m = np.array([p.T_world_camera[:3, 3] for p in scan.poses]).reshape(-1, 3)
+            frame = scan.flown_frame
+            track_m = track_m if frame is None else frame.to_utm(track_m)
+            maps = draw_maps(made, track_m, LARGEST_CELLS, 0.0, is_shaded=False)
         page = report_html(summary, scan.poses, cloud, raster, coverage, shown, maps)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
@@ -46,8 +48,8 @@ def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
     write_whole(out, page)
 
 
-def made_maps(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | None:
-    """Colours of the orthophoto and heights of the surface model in the scan's ENU metres.
+def made_maps(folder: Path, heights: str) -> Raster | None:
+    """Colours of the orthophoto and heights of the surface model, where they lie on the map.
 
     None where one of them is missing, older than scan.json, or above another datum than
     ``heights`` says.
@@ -57,19 +59,19 @@ def made_maps(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | 
         return None
     if min(p.stat().st_mtime_ns for p in (ortho, dsm)) < made.stat().st_mtime_ns:
         return None
-    zero_m = 0.0 if frame is None else frame.alt_amsl_m
     with open_map(dsm, 2) as image, open_map(ortho, 3) as colours:
         if image.tags().get("HEIGHTS") != heights:
             return None
-        box = box_around(image.bounds, None if frame is None else frame.from_utm)
-        west, south, east, north = box
-        grid = over(box, max(colours.transform.a, max(east - west, north - south) / LARGEST_CELLS))
-        height, sigma, *_ = warped(image, *enu_map(grid, frame), grid.shape, is_smooth=False)
-        rgb = warped(colours, *enu_map(grid, frame), grid.shape)[:3].transpose(1, 2, 0)
+        west, south, east, north = image.bounds
+        cell_m = max(colours.transform.a, max(east - west, north - south) / LARGEST_CELLS)
+        grid = over(image.bounds, cell_m)
+        here = transform_of(grid), image.crs or SOME_MAP, grid.shape
+        height, sigma, *_ = warped(image, *here, is_smooth=False)
+        rgb = warped(colours, *here)[:3].transpose(1, 2, 0)
     known = height != NODATA_M
     return Raster(
         grid,
-        np.where(known, height - zero_m, np.nan).astype(np.float32),
+        np.where(known, height, np.nan).astype(np.float32),
         np.where(known, sigma, np.nan).astype(np.float32),
         np.where(known[..., None], rgb, 0).astype(np.uint8),
     )

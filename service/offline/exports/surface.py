@@ -11,6 +11,7 @@ from recon.surface.ground import BareGround, terrain
 from recon.surface.hole_filling import completed, outline
 from recon.surface.raster import (
     STEP_M,
+    Grid,
     Raster,
     highest_lowest,
     reliable,
@@ -19,7 +20,7 @@ from recon.surface.raster import (
     without_cells,
 )
 from recon.types import F32, F64, U8, Bool
-from service.offline.exports.view import ScanView
+from service.offline.exports.view import ScanView, made_once
 
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
@@ -44,37 +45,29 @@ PROBE_M = 1.0
 FILLED, UNCERTAIN = 1, 2
 
 
+@made_once
 def surface_model(scan: ScanView, cell_m: float | None) -> Raster:
     """The surface where it is certain and the air above it was seen.
 
     :func:`recon.surface.raster.reliable` removes uncertain cells.
     """
-
-    def made() -> Raster:
-        measured = scan.raster(cell_m)
-        return _open_to_the_sky(scan, measured, reliable(measured))
-
-    return scan.shared(("surface", cell_m), made)
+    measured = scan.raster(cell_m)
+    return _open_to_the_sky(scan, measured, reliable(measured))
 
 
+@made_once
 def bare_ground(scan: ScanView, cell_m: float | None) -> BareGround:
     """The bare ground below the surface model, within the outline of the survey."""
-
-    def made() -> BareGround:
-        return terrain(surface_model(scan, cell_m), _inside(scan, cell_m))
-
-    return scan.shared(("ground", cell_m), made)
+    return terrain(surface_model(scan, cell_m), _inside(scan, cell_m))
 
 
+@made_once
 def _inside(scan: ScanView, cell_m: float | None) -> Bool:
     measured, sure = scan.raster(cell_m), surface_model(scan, cell_m)
-
-    def made() -> Bool:
-        return outline(measured.known, sure.known, measured.grid.cell_m)
-
-    return scan.shared(("inside", cell_m), made)
+    return outline(measured.known, sure.known, measured.grid.cell_m)
 
 
+@made_once
 def complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
     """The surface without holes inside the outline of the survey, and none beyond it; (rows, cols)
     0 where it is measured, FILLED, or UNCERTAIN.
@@ -83,10 +76,6 @@ def complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
     through. Other cells are filled: below an object as high as that, else from the lower side.
     Noise is smoothed, steps stay.
     """
-    return scan.shared(("complete", cell_m), lambda: _complete_model(scan, cell_m))
-
-
-def _complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
     measured, sure, inside = scan.raster(cell_m), surface_model(scan, cell_m), _inside(scan, cell_m)
     low_m = bare_ground(scan, cell_m).everywhere_m
     kept = _not_seen_through(scan, measured, inside & measured.known & ~sure.known)
@@ -141,14 +130,14 @@ def _not_seen_through(scan: ScanView, measured: Raster, cells: Bool) -> Bool:
     return out
 
 
-def cell_places(scan: ScanView, raster: Raster) -> F64:
-    """(rows, cols, 3) places of the middles of the cells in the scan's frame; NaN where unknown."""
-    grid = raster.grid
+def cell_places(scan: ScanView, grid: Grid, height_m: F32) -> F64:
+    """(rows, cols, 3) places in the scan's frame of the middles of cells with heights (rows, cols);
+    NaN where unknown."""
     x: F64 = grid.west_m + (np.arange(grid.shape[1], dtype=np.float64) + 0.5) * grid.cell_m
     y: F64 = grid.north_m - (np.arange(grid.shape[0], dtype=np.float64) + 0.5) * grid.cell_m
     if scan.frame is not None:
-        return scan.frame.from_utm_grid(x, y, raster.height_m)
-    return np.stack([*np.meshgrid(x, y), raster.height_m.astype(np.float64)], axis=-1)
+        return scan.frame.from_utm_grid(x, y, height_m)
+    return np.stack([*np.meshgrid(x, y), height_m.astype(np.float64)], axis=-1)
 
 
 def _open_to_the_sky(scan: ScanView, measured: Raster, raster: Raster) -> Raster:
@@ -161,7 +150,9 @@ def _open_to_the_sky(scan: ScanView, measured: Raster, raster: Raster) -> Raster
         return raster
     known, reach = raster.known, max(1, round(NEAR_M / raster.grid.cell_m))
     above_m = highest_lowest(measured.height_m, reach)[0] - raster.height_m
-    is_open, _ = scan.air_above(cell_places(scan, raster)[known], heights_m.tolist())
+    is_open, _ = scan.air_above(
+        cell_places(scan, raster.grid, raster.height_m)[known], heights_m.tolist()
+    )
     needed = (heights_m <= usual) | (above_m[known] > OPEN_STEP_M)[:, None]
     hidden = np.zeros(raster.grid.shape, np.bool_)
     hidden[known] = ~(is_open | ~needed).all(axis=1)

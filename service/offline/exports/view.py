@@ -6,7 +6,7 @@ import copy
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +30,7 @@ from service.scans.writing import check_writable
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
-T = TypeVar("T")
+T, Of = TypeVar("T"), TypeVar("Of")
 
 FUSING = 0.6
 """Share of an export that fusing the cloud takes."""
@@ -251,11 +251,10 @@ class ScanView:
     def raster(self, cell_m: float | None) -> Raster:
         """The upper surface on :meth:`grid`, also where it is doubtful."""
         cloud = self.fused.cloud
-
-        def make() -> Raster:
-            return rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m))
-
-        return self.shared(("raster", cell_m), make)
+        return self.shared(
+            ("raster", cell_m),
+            lambda: rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m)),
+        )
 
     def air_above(self, places_m: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:
         """:func:`recon.mapping.free_space.air_above` of all keyframes."""
@@ -268,6 +267,16 @@ class ScanView:
         if self.frame is None:
             raise InputError(f"{self.folder} has no georeference; {what} needs one (fly with GNSS)")
         return self.frame
+
+
+def made_once(make: Callable[[ScanView, Of], T]) -> Callable[[ScanView, Of], T]:
+    """``make``, whose product for a view and one more argument is shared."""
+
+    @wraps(make)
+    def found(scan: ScanView, of: Of) -> T:
+        return scan.shared((make, of), lambda: make(scan, of))
+
+    return found
 
 
 def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) -> Path:

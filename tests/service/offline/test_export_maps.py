@@ -205,23 +205,23 @@ def test_the_report_shows_orthophoto_and_surface_model(tmp_path: Path, house: Ho
     with house.flown(folder) as store:
         heights = write_deliverables(folder, store)["heights"]
     frame, options = LocalFrame(*house.origin), ExportOptions(cell_m=0.25)
-    assert made_maps(folder, frame, heights) is None
+    assert made_maps(folder, heights) is None
     before = (folder / "report.html").read_text()
     with ScanView(folder) as scan:
         for kind in ("dsm", "ortho", "report"):
             export(scan, kind, None, options)
     after = (folder / "report.html").read_text()
     assert after != before and after.count("<img") == before.count("<img")
-    found = made_maps(folder, frame, heights)
+    found = made_maps(folder, heights)
     assert found is not None
-    (row, col), (ground, east) = ((int(v[0]) for v in found.grid.cells(np.array([at])))
-                                  for at in ([10.0, 2.0], [10.0, 12.0]))  # fmt: skip
-    assert found.height_m[row, col] == pytest.approx(6.0, abs=0.3)
-    assert found.height_m[ground, east] == pytest.approx(0.0, abs=0.3)
+    spots = frame.to_utm(np.array([[10.0, 2.0, 6.0], [10.0, 12.0, 0.0]]))
+    (row, ground), (col, east) = found.grid.cells(spots[:, :2])
+    assert found.height_m[row, col] == pytest.approx(spots[0, 2], abs=0.3)
+    assert found.height_m[ground, east] == pytest.approx(spots[1, 2], abs=0.3)
     assert found.rgb[row, col, 0] > 150 > 90 > found.rgb[row, col, 2]  # red, as the roof
-    assert made_maps(folder, frame, "metres above ellipsoid") is None
+    assert made_maps(folder, "metres above ellipsoid") is None
     os.utime(folder / "dsm.tif", ns=(0, 0))  # of an earlier state of the scan
-    assert made_maps(folder, frame, heights) is None
+    assert made_maps(folder, heights) is None
     (folder / "scan.json").write_text("{}")
     with ScanView(folder) as scan, pytest.raises(InputError, match=r"scan\.json cannot be read"):
         export(scan, "report", None, options)

@@ -198,7 +198,7 @@ class FakeVideo(CameraSource):
 
 
 def test_images_come_from_the_video_at_the_keyframes_times(
-    tmp_path: Path, house: HouseFlight
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with house.flown(tmp_path) as store:
         keyframes = list(store.keyframes())
@@ -206,10 +206,10 @@ def test_images_come_from_the_video_at_the_keyframes_times(
         camera = {"K": K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
     video = FakeVideo(house)
+    monkeypatch.setattr(images, "open_camera", lambda _: video)
 
     def views_of(header: ScanHeader, epoch_ns: int | None = None, **how: Any) -> list[TextureView]:
-        opener = {"opener": lambda _: video} | how
-        return images.video_images(keyframes, header, tmp_path, epoch_ns, **opener)
+        return images.video_images(keyframes, header, tmp_path, epoch_ns, **how)
 
     views = views_of(header)
     assert len(views) == 5 and video.closed
@@ -224,10 +224,11 @@ def test_images_come_from_the_video_at_the_keyframes_times(
     np.testing.assert_allclose(small[0].K[0, 0], 140.0)
     with pytest.raises(InputError, match="--video-epoch"):
         views_of(header, 0)
-    with pytest.raises(InputError, match="640x360"):
-        views_of(header, opener=lambda _: FakeVideo(house, (640, 360)))
     with pytest.raises(InputError, match="no camera model"):
         views_of(replace(header, camera={}))
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    with pytest.raises(InputError, match="640x360"):
+        views_of(header)
 
 
 def test_the_file_names_no_path_of_this_machine(
@@ -255,15 +256,18 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
     assert isinstance(failed.exception, InputError)
 
 
-def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFlight) -> None:
+def test_the_recording_that_a_scan_names_is_found(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "scan"
     with house.flown(folder) as store:
         camera = {"K": [1.0] * 9, "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
     video_px = (320, 180)
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, video_px))
 
     def found() -> images.Recording:
-        return images.recording_of(folder, header, lambda _: FakeVideo(house, video_px))
+        return images.recording_of(folder, header)
 
     assert found().path is None  # no scan.json yet
 
@@ -278,7 +282,7 @@ def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFl
     assert name(str(video)).path == video
     for source in ("flight.mp4", str(video), "../flight.mp4"):
         name(source)
-        bounded = images.recording_of(folder, header, lambda _: FakeVideo(house, video_px), folder)
+        bounded = images.recording_of(folder, header, within=folder)
         assert bounded.path is None and "is not there" in bounded.words
     (folder / "link.mp4").symlink_to(video)
     name("link.mp4")
@@ -286,7 +290,7 @@ def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFl
     (folder / "own.mp4").touch()
     for source in ("own.mp4", "flights/own.mp4", "/gone/own.mp4"):
         name(source)
-        bounded = images.recording_of(folder, header, lambda _: FakeVideo(house, video_px), folder)
+        bounded = images.recording_of(folder, header, within=folder)
         assert bounded.path == folder / "own.mp4"
     for source in ("", ".", "..", "/", "link.mp4/..", "a\0b"):
         name(source)

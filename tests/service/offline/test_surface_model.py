@@ -44,7 +44,7 @@ def model(
     """The model of such a scan, what it rests on, and (rows, cols, 3) places of its cells."""
     with ScanView(flown(folder, house, change)) as scan:
         found, origin = complete_model(scan, CELL_M)
-        return found, origin, cell_places(scan, found)
+        return found, origin, cell_places(scan, found.grid, found.height_m)
 
 
 def on_roof(places: F64, margin_m: float) -> Bool:
