@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,6 +30,8 @@ Made = TypeVar("Made")
 TILE_POINTS = 20_000_000
 MARGIN_VOXELS = 25
 POLL_S = 0.2
+MIN_SHARE = 0.01
+"""Of the site's longer side: a smaller tile is mostly margin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,44 +120,32 @@ def grown(box: Box, by_m: float) -> Box:
 def tile_boxes(prints: Sequence[Extent], max_points: int) -> list[Box]:
     """Boxes that cover the site, each with about ``max_points`` stored points at most.
 
-    One box without borders when all points are fewer. Empty boxes are left out. Points are
-    taken as spread evenly over each keyframe's rectangle.
+    One box without borders when all points are fewer; a box of more is halved across its longer
+    side, down to MIN_SHARE of the site's. Empty boxes are left out. Points are taken as spread
+    evenly over each keyframe's rectangle.
     """
-    if sum(p.points for p in prints) <= max_points:
-        return [EVERYWHERE]
     bounds = union(p.box for p in prints)
-    low, high = np.array(bounds[:2]), np.array(bounds[2:])
-    side = float((high - low).max())
-    for _ in range(12):
-        tiles = list(_grid(low, high, side))
-        held = [_points_in(prints, tile) for tile in tiles]
-        if max(held) <= max_points:
-            break
-        side /= 1.5
-    return [tile for tile, points in zip(tiles, held, strict=True) if points > 0.0]
+    least_m = MIN_SHARE * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    rest, out = [[*EVERYWHERE]], list[Box]()
+    while rest:
+        west, south, east, north = box = rest.pop()
+        points = sum(p.points * _share(p.box, box) for p in prints)
+        inner = np.clip(box, np.tile(bounds[:2], 2), np.tile(bounds[2:], 2))
+        axis = int(np.argmax(inner[2:] - inner[:2]))
+        if points > max_points and inner[axis + 2] - inner[axis] > least_m:
+            low, high = box.copy(), box.copy()
+            low[axis + 2] = high[axis] = float(0.5 * (inner[axis] + inner[axis + 2]))
+            rest += [high, low]
+        elif points > 0.0:
+            out.append((west, south, east, north))
+    return out
 
 
-def _grid(low: F64, high: F64, side: float) -> Iterator[Box]:
-    """Tiles of equal size, none wider than ``side``; the outer ones reach to infinity."""
-    across = [max(1, int(np.ceil((high[a] - low[a]) / side - 1e-9))) for a in (0, 1)]
-    edges = [np.linspace(low[a], high[a], across[a] + 1) for a in (0, 1)]
-    for line in edges:
-        line[0], line[-1] = -np.inf, np.inf
-    for south, north in pairwise(edges[1]):
-        for west, east in pairwise(edges[0]):
-            yield float(west), float(south), float(east), float(north)
-
-
-def _points_in(prints: Sequence[Extent], tile: Box) -> float:
-    total = 0.0
-    for p in prints:
-        shares = [
-            max(0.0, min(p.box[a + 2], tile[a + 2]) - max(p.box[a], tile[a]))
-            / max(p.box[a + 2] - p.box[a], 1e-6)
-            for a in (0, 1)
-        ]
-        total += p.points * shares[0] * shares[1]
-    return total
+def _share(part: Box, box: Sequence[float]) -> float:
+    """Of a rectangle that lies in a box."""
+    (west, south, east, north), (w, s, e, n) = part, box
+    across = max(0.0, min(east, e) - max(west, w)) / max(east - west, 1e-6)
+    return across * max(0.0, min(north, n) - max(south, s)) / max(north - south, 1e-6)
 
 
 def overlap(a: Iterable[float], b: Iterable[float]) -> bool:

@@ -157,7 +157,8 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
     vertical = options.datum
     with writing(out) as part, tempfile.TemporaryDirectory(dir=out.parent) as work:
         header, raw, xyz = _stored(scan, options, Path(work) / "points")
-        centre, half = _cube(xyz)
+        low, high = xyz.min(axis=0), xyz.max(axis=0)
+        centre, half = 0.5 * (low + high), float(0.5 * (high - low).max() * 1.001 + 0.01)
         writer = copclib.FileWriter(str(part), _config(header, scan, xyz, centre, half, vertical))
         for key, rows in octree_in_parts(xyz, centre - half, 2.0 * half, options.tile_points):
             data = copclib.VectorChar(raw[rows].ravel())
@@ -189,12 +190,6 @@ def _stored(
     raw = np.memmap(path, np.int8, "r", shape=sizes)
     xyz = np.memmap(path.with_suffix(".xyz"), np.float64, "r", shape=(sizes[0], 3))
     return header, raw, xyz
-
-
-def _cube(xyz: F64) -> tuple[F64, float]:
-    """Centre and half side of a cube around the points, a little larger than them."""
-    low, high = xyz.min(axis=0), xyz.max(axis=0)
-    return 0.5 * (low + high), float(0.5 * (high - low).max() * 1.001 + 0.01)
 
 
 def _config(

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -133,14 +134,6 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     return Layers(grid, bands, ("red", "green", "blue", "opacity")).within(box)
 
 
-def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    _write(scan, out, options, dsm)
-
-
-def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    _write(scan, out, options, dtm)
-
-
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     _write(scan, out, options, ortho)
     scan.shared(("written ortho", options), lambda: out)
@@ -167,6 +160,9 @@ def _write(scan: ScanView, out: Path, options: ExportOptions, make: Make[Layers]
     with mosaic(scan, out, whole or first.grid, first) as image:
         for layers in chain([first], parts):
             put(image, layers)
+
+
+write_dsm, write_dtm = partial(_write, make=dsm), partial(_write, make=dtm)
 
 
 def _finer(scan: ScanView, options: ExportOptions) -> float:

@@ -33,7 +33,6 @@ from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.parallel import run_parallel
 from recon.posegraph.ground_control import Adjusted, KeyframeTrack, Mark, Survey, map_position
-from recon.similarity import Similarity
 from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.refine import own_camera
@@ -166,11 +165,6 @@ def as_seen(
     own = {f.time_unix_ns: T for f, T in zip(marked, found.poses[n:], strict=True)}
     moved = [replace(f, T_world_camera=own.get(f.time_unix_ns, f.T_world_camera)) for f in moved]
     return replace(states, poses=found.poses[:n], scales=states.scales * scales), moved
-
-
-def in_world(images: ImageNetwork, move: Similarity) -> ImageNetwork:
-    """The network in the world that a similarity takes it to."""
-    return replace(images, poses=move.pose(images.poses), points=move.points(images.points))
 
 
 def depth_scales(

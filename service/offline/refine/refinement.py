@@ -44,7 +44,6 @@ from service.offline.refine.by_images import (
     as_seen,
     carried_marks,
     crossing_marks,
-    in_world,
     marked_frames,
     network_of,
     stretches_untied,
@@ -58,7 +57,13 @@ from service.offline.refine.control_points import (
     screen,
 )
 from service.offline.refine.refinement_figures import figures_of, in_words, off_by
-from service.offline.refine.revisions import Revisions, copy_store, grown, moved_frames
+from service.offline.refine.revisions import (
+    Revisions,
+    copy_store,
+    finished_store,
+    grown,
+    moved_frames,
+)
 from service.offline.refine.stored_loops import loose, stored_loops
 from service.offline.refine.survey_file import SurveyPoint, at_times, read_survey
 from service.progress import Progress
@@ -182,12 +187,7 @@ def _target(folder: Path, out: Path | None) -> Iterator[Path]:
 
 def _check_finished(folder: Path) -> None:
     """Raise InputError for a folder without a finished scan of two keyframes or more."""
-    path = folder / "scan.db"
-    if not path.is_file():
-        raise InputError(f"{folder} contains no scan.db; give a scan folder")
-    with ScanStore.open(path) as store:
-        if not store.finished:
-            raise InputError(f"{folder} is not finished; refine it when the flight is over")
+    with finished_store(folder, "refine") as store:
         count = len(store.seqs())
     if count < 2:
         raise InputError(f"{folder} holds {count} keyframe(s); refining takes two or more")
@@ -340,7 +340,14 @@ class _Refinement:
 
     def _with_loops(self, track: KeyframeTrack) -> tuple[KeyframeTrack, int]:
         """The track with its loops, and how many of them were verified."""
-        flown, closures = self._flown_loops(), self._seen_loops(track)
+
+        def at(k: int) -> Keyframe | None:
+            found = self.keyframe(k)
+            if found is None:
+                return None
+            return replace(found, depth=replace(found.depth, T_world_camera=track.poses[k]))
+
+        flown, closures = self._flown_loops(), stored_loops(track, at, self.progress)
         kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
         return replace(track, loops=[*flown, *kept]), len(flown) + len(closures)
 
@@ -372,7 +379,8 @@ class _Refinement:
             ]
         self.frames = [replace(f, T_world_camera=move.pose(f.T_world_camera)) for f in self.frames]
         if self.images is not None:
-            self.images = in_world(self.images, move)
+            poses, points = move.pose(self.images.poses), move.points(self.images.points)
+            self.images = replace(self.images, poses=poses, points=points)
         f = self.frame
         self.header = replace(
             self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
@@ -434,17 +442,6 @@ class _Refinement:
                 spread = unpack_covariance(upper) * np.outer(units, units)
                 out.append(Loop(at[a], at[b], T, loose(T, spread)))
         return out
-
-    def _seen_loops(self, track: KeyframeTrack) -> list[Loop]:
-        """All pairs of keyframes far apart in time that see the same place, verified."""
-
-        def at(k: int) -> Keyframe | None:
-            found = self.keyframe(k)
-            if found is None:
-                return None
-            return replace(found, depth=replace(found.depth, T_world_camera=track.poses[k]))
-
-        return stored_loops(track, at, self.progress)
 
     def _ahead_m(self) -> float:
         """Usual distance of the ground; 0 without any surface."""

@@ -206,6 +206,17 @@ class Revisions:
         )
 
 
+def finished_store(folder: Path, what: str) -> ScanStore:
+    """The store of a finished scan, only to be read; InputError where there is none to ``what``."""
+    if not (folder / "scan.db").is_file():
+        raise InputError(f"{folder} contains no scan.db; give a scan folder")
+    store = ScanStore.open(folder / "scan.db", read_only=True)
+    if store.finished:
+        return store
+    store.close()
+    raise InputError(f"{folder} is not finished; {what} it when the flight is over")
+
+
 def copy_store(source: Path, target: Path) -> None:
     """A sound copy of a store that may be open elsewhere.
 

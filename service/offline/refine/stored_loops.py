@@ -146,13 +146,10 @@ def reach_m(one: Keyframe) -> float:
 
 
 def weighted(loops: Sequence[Loop]) -> list[Loop]:
-    """The loops, less sure where several rest on the same surfaces."""
-    return [replace(one, covariance=_alike(one, loops) * one.covariance) for one in loops]
-
-
-def _alike(one: Loop, loops: Sequence[Loop]) -> int:
-    """Loops that rest on the same filled surfaces as ``one``, itself included: they err alike."""
-    return sum(abs(one.a - x.a) <= NEIGHBOURS and abs(one.b - x.b) <= NEIGHBOURS for x in loops)
+    """The loops, less sure where several rest on the same filled surfaces: they err alike."""
+    ends = np.array([(one.a, one.b) for one in loops]).reshape(-1, 2)
+    near = (np.abs(ends[:, None] - ends).max(axis=2) <= NEIGHBOURS).sum(axis=1)
+    return [replace(o, covariance=n * o.covariance) for o, n in zip(loops, near, strict=True)]
 
 
 def loose(T_a_b: F64, covariance: F64) -> F64:

@@ -215,16 +215,12 @@ def _found(change: Change, body: Body, known: Bool) -> Found:
     rows, cols = (slice(int(x.min()), int(x.max()) + 1) for x in (r, c))
     cells = (change.labels[rows, cols] == body.label) & known[rows, cols]
     east_m, north_m = change.grid.centres(r.mean(keepdims=True), c.mean(keepdims=True))[0].tolist()
+    digits = {"area_m2": 2, "volume_m3": 3, "sigma_m3": 3, "mean_m": 3, "peak_m": 3}
     about = {
         "kind": "added" if body.volume_m3 > 0 else "removed",
         "east_m": round(east_m, 2),
         "north_m": round(north_m, 2),
-        "area_m2": round(body.area_m2, 2),
-        "volume_m3": round(body.volume_m3, 3),
-        "sigma_m3": round(body.sigma_m3, 3),
-        "mean_m": round(body.mean_m, 3),
-        "peak_m": round(body.peak_m, 3),
-    }
+    } | {name: round(getattr(body, name), places) for name, places in digits.items()}
     grid = change.grid.part(rows, cols)
     return Found(body, about, outlines(change, body.label), grid, cells)
 

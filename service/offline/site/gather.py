@@ -21,6 +21,7 @@ from recon.similarity import Similarity
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame, between_frames
+from service.offline.refine.revisions import finished_store
 from service.offline.site import DRONE
 from service.offline.site.start import Pair, placing
 from service.scans.main_piece import main_seqs
@@ -62,7 +63,7 @@ def gather(
     """
     starts = starts or {}
     with ExitStack() as stack:
-        stores = [stack.enter_context(_opened(folder)) for folder in folders]
+        stores = [stack.enter_context(finished_store(folder, "align")) for folder in folders]
         chosen, origin, notes = _chosen(folders, stores, starts)
         header = _site_header(name, [s.header for _, s in chosen], origin)
         members: list[Member] = []
@@ -76,16 +77,6 @@ def gather(
             summary = {"assumed": sorted(assumed), "scans": list(names)}
             site.finish(summary)
     return members, notes
-
-
-def _opened(folder: Path) -> ScanStore:
-    if not (folder / "scan.db").is_file():
-        raise InputError(f"{folder} contains no scan.db; give scan folders")
-    store = ScanStore.open(folder / "scan.db", read_only=True)
-    if store.finished:
-        return store
-    store.close()
-    raise InputError(f"{folder} is not finished; align it when its flight is over")
 
 
 def _chosen(
