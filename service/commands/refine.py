@@ -158,7 +158,7 @@ def refly(
 ) -> None:
     """Plan a mission over gaps, places in too few images and places of large sigma."""
     from service.offline.exports.view import ScanView
-    from service.offline.refine.refly import NO_FLIGHT, plan_json, suggest_as_flown, waypoints_text
+    from service.offline.refine.refly import NO_FLIGHT, plan_json, suggest, waypoints_text
     from service.scans.coverage import coverage_of
     from service.scans.writing import check_writable, write_whole
 
@@ -175,7 +175,7 @@ def refly(
             min_views=found.min_views if views is None else views,
             max_sigma_m=found.max_sigma_m if sigma_m is None else sigma_m,
         )
-        flight = suggest_as_flown(found, scan.poses, overlap, relative, photos)
+        flight = suggest(found, scan.poses, overlap, relative, photos)
     if flight is None:
         print(json.dumps({"lines": 0, "weak_m2": 0.0, "plan": None}) if as_json else NO_FLIGHT)
         return

@@ -27,7 +27,7 @@ from service.offline.refine.refly import (
     NO_FLIGHT,
     geojson,
     plan_json,
-    suggest_as_flown,
+    suggest,
     waypoints_text,
 )
 from service.scans.main_piece import main_track
@@ -195,7 +195,7 @@ def _refly(request: Request) -> Response:
     if found.frame is None:
         raise InputError("the scan has no georeference")
     with ScanStore.peek(folder / "scan.db") as store:
-        flight = suggest_as_flown(found, main_track(store))
+        flight = suggest(found, main_track(store))
     if kind == "geojson":
         return Response(geojson(flight, found.frame), media_type="application/geo+json")
     if flight is None:

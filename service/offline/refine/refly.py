@@ -203,37 +203,25 @@ def in_order(groups: Sequence[F64], begin_m: F64) -> F64:
     return np.concatenate(out)
 
 
-def suggest_as_flown(
+def suggest(
     coverage: Coverage,
     poses: Sequence[PoseRecord],
     overlap: float = 0.6,
     relative: bool = False,
     photos: bool = False,
 ) -> Refly | None:
-    """:func:`suggest` at the height and the speed that ``poses`` were flown with."""
-    heights = [p.agl_m for p in poses if p.agl_m is not None]
-    height = float(np.median(heights)) if heights else None
-    moving = [p.speed_m_s for p in poses if p.speed_m_s > 0.2]
-    speed = float(np.median(moving)) if moving else 3.0
-    return suggest(coverage, speed, height, overlap, relative, photos)
-
-
-def suggest(
-    coverage: Coverage,
-    speed_m_s: float,
-    height_m: float | None,
-    overlap: float = 0.6,
-    relative: bool = False,
-    photos: bool = False,
-) -> Refly | None:
     """A flight over the weak areas; None when no weak place is large enough.
 
-    ``overlap`` is that of neighbouring lines' images. Altitudes are AMSL as flown, or
-    ``relative`` to home by the height above ground flown.
+    Height and speed are those of ``poses``. ``overlap`` is that of neighbouring lines' images.
+    Altitudes are AMSL as flown, or ``relative`` to home by the height above ground flown.
 
     Raises InputError when the scan is not georeferenced, holds too few keyframes, or the
     weak areas would take more than MAX_LINES lines.
     """
+    heights = [p.agl_m for p in poses if p.agl_m is not None]
+    height_m = float(np.median(heights)) if heights else None
+    moving = [p.speed_m_s for p in poses if p.speed_m_s > 0.2]
+    speed_m_s = float(np.median(moving)) if moving else 3.0
     if not 0.0 <= overlap <= 0.9:
         raise InputError(f"overlap {overlap:g} is not 0 to 0.9")
     frame = coverage.frame

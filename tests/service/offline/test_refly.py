@@ -23,8 +23,9 @@ from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.refine import refly
-from service.offline.refine.refly import Refly, plan_json, suggest, waypoints_text
+from service.offline.refine.refly import Refly, plan_json, waypoints_text
 from service.scans.coverage import Coverage
+from service.stream.records import PoseRecord
 
 if TYPE_CHECKING:
     from house_flight import HouseFlight
@@ -62,6 +63,11 @@ def covered(depths: list[DepthMap], frame: LocalFrame | None = FRAME) -> Coverag
     return Coverage(grid, frame, layer.places(), 3, 0.3)
 
 
+def suggest(coverage: Coverage, agl_m: float | None = HEIGHT_M, **how: Any) -> Refly | None:
+    pose = PoseRecord(0, np.eye(4), np.eye(6), agl_m=agl_m, speed_m_s=5.0)
+    return refly.suggest(coverage, [pose], **how)
+
+
 def two_lines(apart_m: float = 130.0, forward: float = 0.0) -> list[DepthMap]:
     there = [looking_down(8.0 * k, 0.0, forward) for k in range(25)]
     back = [looking_down(8.0 * k, apart_m, forward) for k in range(25)]
@@ -94,7 +100,7 @@ def weak_spots(coverage: Coverage, flight: Refly) -> F64:
 @pytest.mark.parametrize("apart_m", [100.0, 130.0, 260.0])
 def test_every_weak_cell_comes_into_the_image(apart_m: float) -> None:
     coverage = covered(two_lines(apart_m))
-    flight = suggest(coverage, 5.0, HEIGHT_M)
+    flight = suggest(coverage)
     assert flight is not None
     spots = weak_spots(coverage, flight)
     assert 4.0 * len(spots) > 0.7 * 200 * (apart_m - 64)
@@ -102,7 +108,7 @@ def test_every_weak_cell_comes_into_the_image(apart_m: float) -> None:
 
 
 def test_the_swath_is_the_image_flown() -> None:
-    flight = suggest(covered(two_lines()), 5.0, HEIGHT_M)
+    flight = suggest(covered(two_lines()))
     assert flight is not None
     swath = flight.swath
     assert swath.across_m == pytest.approx(64.0, rel=0.02)
@@ -117,7 +123,7 @@ def test_the_swath_is_the_image_flown() -> None:
 
 def test_more_overlap_takes_more_lines() -> None:
     coverage = covered(two_lines(260.0))
-    few, many = suggest(coverage, 5.0, HEIGHT_M, 0.2), suggest(coverage, 5.0, HEIGHT_M, 0.8)
+    few, many = suggest(coverage, overlap=0.2), suggest(coverage, overlap=0.8)
     assert few is not None and many is not None
     assert len(many.lines) >= 3 * len(few.lines)
 
@@ -125,7 +131,7 @@ def test_more_overlap_takes_more_lines() -> None:
 def test_a_camera_that_looks_ahead_flies_behind_its_line() -> None:
     tilt = np.radians(25.0)
     coverage = covered(two_lines(160.0, forward=tilt))
-    flight = suggest(coverage, 5.0, HEIGHT_M)
+    flight = suggest(coverage)
     assert flight is not None
     assert flight.swath.ahead_m == pytest.approx(HEIGHT_M * np.tan(tilt), rel=0.05)
     spots = weak_spots(coverage, flight)
@@ -133,7 +139,7 @@ def test_a_camera_that_looks_ahead_flies_behind_its_line() -> None:
 
 
 def test_neighbours_are_flown_back_and_forth() -> None:
-    flight = suggest(covered(two_lines(260.0)), 5.0, HEIGHT_M)
+    flight = suggest(covered(two_lines(260.0)))
     assert flight is not None
     for a, b in zip(flight.lines, flight.lines[1:], strict=False):
         assert np.linalg.norm(b[0] - a[1]) < 1.5 * flight.spacing_m
@@ -141,7 +147,7 @@ def test_neighbours_are_flown_back_and_forth() -> None:
 
 def test_the_strips_of_ground_hold_every_weak_cell() -> None:
     coverage = covered(two_lines(forward=0.3))
-    flight = suggest(coverage, 5.0, HEIGHT_M)
+    flight = suggest(coverage)
     assert flight is not None
     rings = [
         FRAME.to_enu(np.array([[lat, lon, FRAME.alt_amsl_m] for lon, lat in g["coordinates"][0]]))
@@ -186,16 +192,16 @@ def test_weak_ground_of_a_small_part_of_an_image_is_ignored(side_cells: int, kep
 
 
 def test_nothing_weak_needs_no_flight() -> None:
-    assert suggest(covered(two_lines(30.0)), 5.0, HEIGHT_M) is None
+    assert suggest(covered(two_lines(30.0))) is None
 
 
 def test_what_cannot_be_planned_says_why() -> None:
     with pytest.raises(InputError, match="no georeference"):
-        suggest(covered(two_lines(), frame=None), 5.0, HEIGHT_M)
+        suggest(covered(two_lines(), frame=None))
     with pytest.raises(InputError, match="overlap"):
-        suggest(covered(two_lines()), 5.0, HEIGHT_M, overlap=1.0)
+        suggest(covered(two_lines()), overlap=1.0)
     with pytest.raises(InputError, match="height above ground"):
-        suggest(covered(two_lines()), 5.0, None, relative=True)
+        suggest(covered(two_lines()), None, relative=True)
     with pytest.raises(InputError, match="single keyframe"):
         refly.flown_swath(np.zeros(1, PLACE), FRAME, 1.0, 1.0)
     standing = np.zeros(3, PLACE)
@@ -210,7 +216,7 @@ def wanted(flight: Refly) -> list[tuple[int, int, float, float, float]]:
 
 @pytest.mark.parametrize("relative", [False, True])
 def test_pymavlink_reads_the_waypoints(tmp_path: Path, relative: bool) -> None:
-    flight = suggest(covered(two_lines()), 5.0, HEIGHT_M, relative=relative, photos=relative)
+    flight = suggest(covered(two_lines()), relative=relative, photos=relative)
     assert flight is not None
     path = tmp_path / "refly.waypoints"
     path.write_text(waypoints_text(flight))
@@ -273,7 +279,7 @@ def imported(path: Path) -> Any:
 
 
 def test_mavsdk_reads_the_plan(tmp_path: Path) -> None:
-    flight = suggest(covered(two_lines()), 5.0, HEIGHT_M)
+    flight = suggest(covered(two_lines()))
     assert flight is not None
     path = tmp_path / "refly.plan"
     path.write_text(plan_json(flight))
