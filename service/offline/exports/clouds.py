@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,14 +21,7 @@ from service.georeference import map_crs
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
-from service.scans.fused_cloud import (
-    CHUNK_POINTS,
-    SCALE_M,
-    Box,
-    las_header,
-    point_record,
-    write_laz,
-)
+from service.scans.fused_cloud import CHUNK_POINTS, SCALE_M, Box, write_laz
 from service.scans.writing import writing, writing_folder
 
 if TYPE_CHECKING:
@@ -86,11 +80,13 @@ def ply_head(comment: str, count: int, fields: Iterable[tuple[str, str]]) -> byt
 
 def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """LAZ, or plain LAS where the name ends so; points of the bare ground have class 2."""
-    laz = out.suffix.lower() != ".las"
-    started_ns = scan.store.header.started_unix_ns
     with writing(out) as file:
-        parts = points_of(scan, options)
-        write_laz(file, parts, scan.frame, started_ns, laz, options.datum, scan.shared_sigma)
+        _write_las(scan, file, options, laz=out.suffix.lower() != ".las")
+
+
+def _write_las(scan: ScanView, path: Path, options: ExportOptions, laz: bool) -> None:
+    parts, started_ns = points_of(scan, options), scan.store.header.started_unix_ns
+    write_laz(path, parts, scan.frame, started_ns, laz, options.datum, scan.shared_sigma)
 
 
 def points_of(
@@ -100,14 +96,13 @@ def points_of(
 
     Raises InputError, at the first, when there is not a single point.
     """
-    make, margin_m = (_classified, GROUND_MARGIN_M) if is_classified else (_placed, VOXELS_MARGIN_M)
-    return in_parts(scan, make, options, margin_m)
+    margin_m = GROUND_MARGIN_M if is_classified else VOXELS_MARGIN_M
+    return in_parts(scan, partial(_placed, is_classified=is_classified), options, margin_m)
 
 
-def _placed(
-    scan: ScanView, _: ExportOptions, box: Box, kinds: U8 | None = None
-) -> PlacedPart | None:
+def _placed(scan: ScanView, _: ExportOptions, box: Box, is_classified: bool) -> PlacedPart | None:
     """The points in the box; None without any."""
+    kinds = classes(scan) if is_classified else None
     west, south, east, north = box
     x, y = scan.xyz_m[:, 0], scan.xyz_m[:, 1]
     outside = (x < west) | (x >= east) | (y < south) | (y >= north)
@@ -117,10 +112,6 @@ def _placed(
         return scan.fused.cloud, scan.xyz_m, kinds
     kept = None if kinds is None else kinds[~outside]
     return without(scan.fused.cloud, outside), scan.xyz_m[~outside], kept
-
-
-def _classified(scan: ScanView, options: ExportOptions, box: Box) -> PlacedPart | None:
-    return _placed(scan, options, box, classes(scan))
 
 
 UNCLASSIFIED, GROUND = 1, 2
@@ -153,14 +144,22 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
     The points wait in a file beside ``out``: the upper levels of the octree are of all tiles.
     """
     import copclib
+    import laspy
 
-    vertical = options.datum
     with writing(out) as part, tempfile.TemporaryDirectory(dir=out.parent) as work:
-        header, raw, xyz = _stored(scan, options, Path(work) / "points")
-        low, high = xyz.min(axis=0), xyz.max(axis=0)
-        centre, half = 0.5 * (low + high), float(0.5 * (high - low).max() * 1.001 + 0.01)
-        writer = copclib.FileWriter(str(part), _config(header, scan, xyz, centre, half, vertical))
-        for key, rows in octree_in_parts(xyz, centre - half, 2.0 * half, options.tile_points):
+        las = Path(work) / "points.las"
+        _write_las(scan, las, options, laz=False)
+        with laspy.open(las) as points:
+            header = points.header
+        sizes = header.point_count, header.point_format.size
+        raw = np.memmap(las, np.int8, "r", header.offset_to_point_data, sizes)
+        xyz = raw[:, :12].view("<i4")  # in units of SCALE_M
+        half_m = 0.5 * float((header.maxs - header.mins).max()) * 1.001 + 0.01
+        config = _config(las, header, scan, half_m, options.datum)
+        writer = copclib.FileWriter(str(part), config)
+        low = (0.5 * (header.mins + header.maxs) - half_m - header.offsets) / SCALE_M
+        side = 2.0 * half_m / SCALE_M
+        for key, rows in octree_in_parts(xyz, low, side, options.tile_points):
             data = copclib.VectorChar(raw[rows].ravel())
             writer.AddNode(copclib.VoxelKey(*key), data)
         writer.Close()
@@ -171,38 +170,13 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
             file.write(len(raw).to_bytes(8, "little"))
 
 
-def _stored(
-    scan: ScanView, options: ExportOptions, path: Path
-) -> tuple[laspy.LasHeader, Array, F64]:
-    """LAS header, (N, bytes) records and (N, 3) places of all points, mapped from files."""
-    header, sizes = None, (0, 0)
-    with open(path, "wb") as file, open(path.with_suffix(".xyz"), "wb") as places:
-        for cloud, xyz_m, kinds in points_of(scan, options):
-            if header is None:
-                started_ns = scan.store.header.started_unix_ns
-                header = las_header(xyz_m, scan.frame, started_ns, options.datum)
-            record = point_record(header, xyz_m, cloud, scan.shared_sigma)
-            record["classification"] = kinds
-            file.write(record.memoryview())
-            places.write(np.column_stack([record.x, record.y, record.z]).data)
-            sizes = sizes[0] + len(record), record.point_size
-    assert header is not None  # else points_of raises
-    raw = np.memmap(path, np.int8, "r", shape=sizes)
-    xyz = np.memmap(path.with_suffix(".xyz"), np.float64, "r", shape=(sizes[0], 3))
-    return header, raw, xyz
-
-
 def _config(
-    header: laspy.LasHeader,
-    scan: ScanView,
-    xyz: F64,
-    centre: F64,
-    half: float,
-    vertical: str | None,
+    las: Path, header: laspy.LasHeader, scan: ScanView, half_m: float, vertical: str | None
 ) -> copclib.CopcConfigWriter:
     import copclib
 
-    extra = _extra_bytes(header)
+    # Extra dimensions: copclib can read their description but not build it.
+    extra = copclib.LazReader(str(las)).laz_config.extra_bytes_vlr
     vector = copclib.Vector3
     wkt = ""
     if scan.frame is not None:  # WKT1 knows no ellipsoidal heights of a map
@@ -211,32 +185,23 @@ def _config(
     config = copclib.CopcConfigWriter(
         7, vector([SCALE_M] * 3), vector(list(map(float, header.offsets))), wkt, extra, False
     )
-    config.las_header.min = vector(list(map(float, xyz.min(axis=0))))
-    config.las_header.max = vector(list(map(float, xyz.max(axis=0))))
+    config.las_header.min = vector(list(map(float, header.mins)))
+    config.las_header.max = vector(list(map(float, header.maxs)))
     config.las_header.generating_software = "skyrelief"
     config.las_header.SetGpsTimeBit()  # standard time
     info = config.copc_info
-    info.center_x, info.center_y, info.center_z = map(float, centre)
-    info.halfsize = half
-    info.spacing = 2.0 * half / SAMPLES_PER_SIDE
+    info.center_x, info.center_y, info.center_z = map(float, 0.5 * (header.mins + header.maxs))
+    info.halfsize = half_m
+    info.spacing = 2.0 * half_m / SAMPLES_PER_SIDE
     return config
-
-
-def _extra_bytes(header: laspy.LasHeader) -> copclib.EbVlr:
-    """The description of the extra dimensions; copclib can read it but not build it."""
-    import copclib
-    import laspy
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "one_point.laz"
-        laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(1, header=header)).write(str(path))
-        return copclib.LazReader(str(path)).laz_config.extra_bytes_vlr
 
 
 Node = tuple[int, int, int, int]
 
 
-def octree_in_parts(xyz: F64, low: F64, side: float, max_points: int) -> Iterator[tuple[Node, I64]]:
+def octree_in_parts(
+    xyz: Array, low: F64, side: float, max_points: int
+) -> Iterator[tuple[Node, I64]]:
     """As :func:`octree`, but below the first levels each node by itself.
 
     The first levels are as many as leave about ``max_points`` to each node below, if points are
@@ -284,7 +249,7 @@ def _packed(unit: F64, count: int, bits: int = 21) -> I64:
 
 
 def octree(
-    xyz: F64, low: F64, side: float, rows: I64 | None = None, first_depth: int = 0
+    xyz: Array, low: F64, side: float, rows: I64 | None = None, first_depth: int = 0
 ) -> Iterator[tuple[Node, I64]]:
     """(depth, x, y, z) of each node and the rows of its points; every row appears once."""
     rows = np.arange(len(xyz)) if rows is None else rows
