@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -37,37 +38,19 @@ Columns = Mapping[str, Sequence[float | str]]
 """Values of each shape by name, real or text."""
 
 
+Shape = F64 | Sequence[Sequence[F64]]
+"""Of a POINT (1, 2) map metres, of a LINESTRING (N, 3) map metres and heights, of a MULTIPOLYGON
+its polygons, each an outer ring and its holes, (N, 2) map metres, closed."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """Shapes in WKB, all of one kind, their places in map metres, and their columns."""
+    """Shapes, all of one kind, and their columns."""
 
     table: str
-    kind: str
-    shapes: Sequence[bytes]
-    places: Sequence[F64]  # (N, 2) each
+    kind: Literal["POINT", "LINESTRING", "MULTIPOLYGON"]
+    shapes: Sequence[Shape]
     columns: Columns
-    with_heights: int = 0  # whether the shapes have them
-
-
-def polygons(table: str, shapes: Sequence[Sequence[Sequence[F64]]], columns: Columns) -> Layer:
-    """A layer of multipolygons.
-
-    ``shapes[n]`` are polygons, each an outer ring and its holes, (N, 2) map metres, closed.
-    """
-    places = [ring for shape in shapes for rings in shape for ring in rings]
-    return Layer(table, "MULTIPOLYGON", [_polygons(s) for s in shapes], places, columns)
-
-
-def lines(table: str, shapes: Sequence[F64], columns: Columns) -> Layer:
-    """A layer of lines, (N, 3) each: map metres and heights."""
-    places = [line[:, :2] for line in shapes]
-    return Layer(table, "LINESTRING", [_line(line) for line in shapes], places, columns, 1)
-
-
-def points(table: str, places: F64, columns: Columns) -> Layer:
-    """A layer of points, (N, 2) map metres."""
-    wkb = [struct.pack("<BIdd", 1, 1, x, y) for x, y in places.tolist()]
-    return Layer(table, "POINT", wkb, [places], columns)
 
 
 def write_layers(path: Path, epsg: int, layers: Sequence[Layer]) -> None:
@@ -93,7 +76,7 @@ def write_layers(path: Path, epsg: int, layers: Sequence[Layer]) -> None:
 def _put(db: sqlite3.Connection, epsg: int, layer: Layer) -> None:
     table, kind, columns = layer.table, layer.kind, layer.columns
     kinds = {n: "TEXT" if v and isinstance(v[0], str) else "DOUBLE" for n, v in columns.items()}
-    ends = np.concatenate([*layer.places, np.zeros((0, 2))])
+    ends = np.concatenate([*(p[:, :2] for s in layer.shapes for p in _parts(s)), np.zeros((0, 2))])
     ends = ends if len(ends) else np.full((1, 2), np.nan)  # SQLite: NULL
     box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
     db.execute(
@@ -103,7 +86,7 @@ def _put(db: sqlite3.Connection, epsg: int, layer: Layer) -> None:
     )
     db.execute(
         "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, ?, 0)",
-        (table, kind, epsg, layer.with_heights),
+        (table, kind, epsg, kind == "LINESTRING"),
     )
     typed = "".join(f', "{n}" {of}' for n, of in kinds.items())
     db.execute(
@@ -111,22 +94,23 @@ def _put(db: sqlite3.Connection, epsg: int, layer: Layer) -> None:
     )
     marks = ", ".join("?" * (1 + len(columns)))
     names = "".join(f', "{n}"' for n in columns)
-    rows = [
-        (b"GP\x00\x01" + struct.pack("<i", epsg) + shape, *(v[n] for v in columns.values()))
-        for n, shape in enumerate(layer.shapes)
-    ]
+    head = b"GP\x00\x01" + struct.pack("<i", epsg)
+    shapes = (head + _wkb(kind, shape) for shape in layer.shapes)
+    rows = zip(shapes, *columns.values(), strict=True)
     db.executemany(f'INSERT INTO "{table}" (geom{names}) VALUES ({marks})', rows)
 
 
-def _polygons(polygons: Sequence[Sequence[F64]]) -> bytes:
-    """A MultiPolygon as little-endian WKB."""
-    parts = [struct.pack("<BII", 1, 6, len(polygons))]
-    for rings in polygons:
+def _parts(shape: Shape) -> list[F64]:
+    return [shape] if isinstance(shape, np.ndarray) else [ring for rings in shape for ring in rings]
+
+
+def _wkb(kind: str, shape: Shape) -> bytes:
+    """Little-endian WKB."""
+    if isinstance(shape, np.ndarray):
+        of, count = (1, b"") if kind == "POINT" else (1002, struct.pack("<I", len(shape)))
+        return struct.pack("<BI", 1, of) + count + shape.astype("<f8").tobytes()
+    parts = [struct.pack("<BII", 1, 6, len(shape))]
+    for rings in shape:
         parts.append(struct.pack("<BII", 1, 3, len(rings)))
         parts += [struct.pack("<I", len(ring)) + ring.astype("<f8").tobytes() for ring in rings]
     return b"".join(parts)
-
-
-def _line(line: F64) -> bytes:
-    """A LineString Z as little-endian WKB."""
-    return struct.pack("<BII", 1, 1002, len(line)) + np.asarray(line, "<f8").tobytes()

@@ -20,7 +20,7 @@ from service.georeference import LocalFrame, geojson_of, line_geometry
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground
 from service.offline.exports.view import ExportOptions, ScanView, in_parts, made_once
-from service.offline.geopackage import Columns, lines, points, write_layers
+from service.offline.geopackage import Columns, Layer, write_layers
 from service.scans.annotations import Point, Spot, read_annotations
 from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.writing import write_whole
@@ -89,7 +89,7 @@ def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> No
         "is_index": [float(one.is_index) for one in found],
         "label": [one.label for one in found],
     }
-    layers = [lines("contours", [one.places for one in found], columns)]
+    layers = [Layer("contours", "LINESTRING", [one.places for one in found], columns)]
     notes = read_annotations(scan.folder).features
     shapes = [_in_utm(frame, one.geometry.coordinates) for one in notes]
     spots = [k for k, one in enumerate(notes) if isinstance(one.geometry, Point)]
@@ -105,9 +105,11 @@ def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> No
     if spots:
         places = np.concatenate([shapes[k] for k in spots])
         height: Columns = {options.height_key: places[:, 2].tolist()}
-        layers.append(points("annotations", places[:, :2], {**height, **about(spots)}))
+        layers.append(
+            Layer("annotations", "POINT", [*places[:, None, :2]], {**height, **about(spots)})
+        )
     if ways:
-        layers.append(lines("measurements", [shapes[k] for k in ways], about(ways)))
+        layers.append(Layer("measurements", "LINESTRING", [shapes[k] for k in ways], about(ways)))
     write_layers(out, frame.epsg, layers)
 
 

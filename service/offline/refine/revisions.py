@@ -111,20 +111,14 @@ class Revisions:
 
     def _state(self, seq: int, below: int) -> tuple[int, Repose] | None:
         """Time and pose of a keyframe; None when nothing of it can be read."""
-        data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
         base = self._store.repose(seq, below=below)
-        if data is None:
-            keyframe = self._store.keyframe(seq)
-            if keyframe is None:
-                return None
-            time_ns, T = keyframe.time_ns, keyframe.depth.T_world_camera
-            covariance = keyframe.pose.covariance
-        else:
-            unpacked = codec.unpack(data)
-            if unpacked is None:
-                return None
-            head, _ = unpacked
+        head = codec.peek(self._store.chunk(seq, 0) or self._store.chunk(seq, 1) or b"")
+        if head is not None:
             time_ns, T, covariance = head.time_unix_ns, head.T_world_camera, head.covariance
+        elif (one := self._store.keyframe(seq)) is not None:
+            time_ns, T, covariance = one.time_ns, one.depth.T_world_camera, one.pose.covariance
+        else:
+            return None
         return time_ns, base or Repose(seq, 0, T, 1.0, covariance)
 
     def keyframe(self, states: KeyframeStates, k: int) -> Keyframe | None:

@@ -32,7 +32,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
 from service.offline.exports.view import USUAL, ExportOptions, ScanView, in_parts
-from service.offline.geopackage import polygons, write_layers
+from service.offline.geopackage import Layer, write_layers
 from service.offline.site.alignment import AlignedSite, align_site, write_files
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
 from service.offline.site.gather import Member
@@ -359,5 +359,5 @@ def _write_polygons(view: ScanView, path: Path, change: Changes) -> None:
     names = ("kind", "area_m2", "volume_m3", "sigma_m3", "mean_m", "peak_m")
     shapes = [each.rings for each in change.objects]
     columns = {name: [each.about[name] for each in change.objects] for name in names}
-    layers = [polygons("changes", shapes, columns)]
+    layers = [Layer("changes", "MULTIPOLYGON", shapes, columns)]
     write_layers(path, view.needs_place("a GeoPackage").epsg, layers)
