@@ -108,7 +108,7 @@ def _below_objects(
     below = cells & (up_m > OPEN_STEP_M) & (far * measured.grid.cell_m < OBJECT_REACH_M)
     is_open, is_hidden = np.zeros((2, int(below.sum())), np.bool_)
     for down_m in (BENEATH_M, 0.25 * up_m):
-        places = _places(scan, replace(measured, height_m=top_m - down_m), below)
+        places = cell_places(scan, measured.grid, top_m - down_m)[below]
         free, behind = scan.air_above(places, (0.0,))
         is_open |= free[:, 0]
         is_hidden |= behind[:, 0] > 0
@@ -124,7 +124,8 @@ def _below_objects(
 
 def _not_seen_through(scan: ScanView, measured: Raster, cells: Bool) -> Bool:
     """Those of the ``cells`` (rows, cols) whose surface no keyframe sees through."""
-    is_open, _ = scan.air_above(_places(scan, measured, cells), (-PROBE_M,))
+    places = cell_places(scan, measured.grid, measured.height_m)[cells]
+    is_open, _ = scan.air_above(places, (-PROBE_M,))
     out: Bool = cells.copy()
     out[cells] = ~is_open[:, 0]
     return out
@@ -157,9 +158,3 @@ def _open_to_the_sky(scan: ScanView, measured: Raster, raster: Raster) -> Raster
     hidden = np.zeros(raster.grid.shape, np.bool_)
     hidden[known] = ~(is_open | ~needed).all(axis=1)
     return without_cells(raster, hidden)
-
-
-def _places(scan: ScanView, raster: Raster, cells: Bool) -> F64:
-    """(N, 3) places of the middles of some of the cells in the scan's frame."""
-    places = np.column_stack([raster.grid.centres(*np.nonzero(cells)), raster.height_m[cells]])
-    return places if scan.frame is None else scan.frame.from_utm(places)
