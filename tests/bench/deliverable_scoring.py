@@ -25,10 +25,12 @@ import numpy as np
 
 from recon.surface import metrics, triangle_grid
 from recon.surface.metrics import Fit
+from recon.surface.raster import STEP_M
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F32, F64, U8, Array, Bool, Camera
 from service.errors import InputError
 from service.georeference import LocalFrame
+from service.offline.exports.surface import FILLED, UNCERTAIN
 from service.sim.recording import Simulation, SimulationOptions, prepare
 from service.sim.render import Look, Renderer
 from service.sim.scoring import alignments, read_scan
@@ -88,7 +90,8 @@ def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
 
     Band 3, where there is one, marks filled cells: they have figures of their own. ``inside`` is
     the share of known cells within the outline of the known ones, ``half_cell_rms_m`` what the true
-    heights of places half a cell to the east would have: no step is placed better.
+    heights of places half a cell to the east would have: no step is placed better. ``objects`` are
+    the shares of filled and of uncertain cells where something stands above the ground.
     """
     from scipy.ndimage import binary_fill_holes
 
@@ -114,7 +117,17 @@ def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         out[name]["half_cell_rms_m"] = float(np.sqrt(np.nanmean(beside**2)))
         if is_filled.any():
             out[name]["filled"] = _height_figures(error[on_truth & is_filled])
+            stands = true - _ground_m(truth.surface, moved[:, :2]) > STEP_M
+            kinds = image.bands[2][known][stands]
+            out[name]["objects"] = [float((kinds == kind).mean()) for kind in (FILLED, UNCERTAIN)]
     return out
+
+
+def _ground_m(surface: TriangleGrid, xy_m: F64) -> F64:
+    """(N,) height of the lowest surface at (N, 2) places; NaN outside."""
+    below = np.column_stack([xy_m, np.full(len(xy_m), surface.bounds[2] - 10.0)])
+    t, _ = surface.cast(below, np.tile([0.0, 0.0, 1.0], (len(below), 1)))
+    return np.asarray(below[:, 2] + t)
 
 
 def _height_figures(error: F64) -> dict[str, float]:
