@@ -10,11 +10,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
@@ -34,8 +35,8 @@ from recon.posegraph.sensor_offsets import constants
 from recon.types import Camera, Keyframe, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cameras.rig import Rig
-from service.config import CameraConfig, FusionConfig, ScanConfig
-from service.errors import InputError
+from service.config import Config
+from service.errors import InputError, refusing
 from service.georeference import LocalFrame
 from service.offline.refine import own_camera
 from service.offline.refine.by_images import (
@@ -533,26 +534,15 @@ def _survey(candidates: Sequence[Candidate]) -> Survey:
     return np.reshape(places, (-1, 3)), np.reshape(sigmas, (-1, 3))
 
 
-Section = TypeVar("Section")
-
-
-def _section(kind: type[Section], kept: Any) -> Section:
-    """A part of the configuration as it was kept, with defaults for what was not."""
-    known = {f.name for f in fields(kind)} if is_dataclass(kind) else set()
-    return kind(**{k: v for k, v in dict(kept or {}).items() if k in known})
-
-
 def _ms(time_ns: float) -> int:
     return round(time_ns / 1e6)
 
 
 def _rig(header: ScanHeader, frame: LocalFrame) -> Rig:
     """The rig that the scan was flown with, about the scan's own origin."""
-    kept = header.configuration
-    rig = Rig(
-        _section(CameraConfig, kept.get("camera")),
-        _section(ScanConfig, kept.get("scan")),
-        _section(FusionConfig, kept.get("fusion")),
-    )
+    kept = {name: header.configuration.get(name) or {} for name in ("camera", "scan", "fusion")}
+    with refusing(f"scan {header.scan_id}, its configuration"):
+        flown = msgspec.convert(kept, Config)
+    rig = Rig(flown.camera, flown.scan, flown.fusion)
     rig.local_frame = frame
     return rig
