@@ -34,12 +34,13 @@ from service.offline.refine.stored_loops import BREAK_S, stored_loops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
 from service.offline.site.start import SIGMA_SCALE as START_SCALE
-from service.offline.site.start import Pair, start_of
+from service.offline.site.start import Pair
 from service.progress import Progress
 from service.scans.folder import resolution_m, write_deliverables
 from service.scans.fused_cloud import TiledCloud
 from service.scans.track import local_frame
 from service.scans.writing import write_whole
+from service.small_file import read_json
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
@@ -58,6 +59,7 @@ SIGMA_SCALE = 0.01
 SAME_SCALE = 1e-5
 """Sigma of the scale along a scan: what a flight's scale varies by is shift of its keyframes."""
 
+MAX_SITE_BYTES = 100_000_000
 KEPT = 128
 """Keyframes held in memory while ties are sought."""
 
@@ -137,15 +139,11 @@ def _align(
     folders: Sequence[Path], out: Path, starts: Mapping[Path, list[Pair]], progress: Progress
 ) -> AlignedSite:
     known = _known(out)
-    earlier = [Path(s["folder"]) for s in known.get("scans", [])]
+    earlier = [Path(scan.folder) for scan in known.scans]
     gone = [f for f in earlier if not (f / "scan.db").is_file()]
     folders = [*(f for f in earlier if f not in gone), *folders]
     unique = list(dict.fromkeys(f.resolve() for f in folders))
-    known_starts = {
-        Path(s["folder"]): start_of(s["start"], str(out / SITE))
-        for s in known.get("scans", [])
-        if s.get("start") is not None
-    }
+    known_starts = {Path(s.folder): s.start for s in known.scans if s.start is not None}
     starts = known_starts | {folder.resolve(): start for folder, start in starts.items()}
     strange = [str(folder) for folder in starts if folder not in unique]
     fresh = out / ".scan.db.new"
@@ -170,20 +168,26 @@ def _align(
     return AlignedSite(out, members, found, document)
 
 
-def _known(out: Path) -> dict[str, Any]:
-    """The document of an earlier alignment in ``out``; InputError when it is another folder."""
-    if not out.exists():
-        return {}
-    if not (out / SITE).is_file():
-        if out.is_dir() and not any(path.name[0] != "." for path in out.iterdir()):
-            return {}  # empty, or left by a process that was killed
-        raise InputError(f"{out} exists and is not a site; choose another folder")
-    try:
-        document = json.loads((out / SITE).read_text(encoding="utf-8"))
-        scans = [Path(s["folder"]) for s in document["scans"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{out / SITE} cannot be read; remove the folder") from error
-    return dict(document) if scans else {}
+class KnownScan(msgspec.Struct):
+    folder: str
+    start: list[Pair] | None = None
+
+
+class KnownSite(msgspec.Struct):
+    """What an alignment takes from the document of the one before it."""
+
+    scans: list[KnownScan] = []
+    revision: int = 0
+    history: list[dict[str, Any]] = []
+
+
+def _known(out: Path) -> KnownSite:
+    """The earlier alignment in ``out``; InputError when it is another folder."""
+    if (out / SITE).is_file():
+        return read_json(out / SITE, KnownSite, MAX_SITE_BYTES, "a site; remove the folder")
+    if not out.exists() or (out.is_dir() and all(path.name[0] == "." for path in out.iterdir())):
+        return KnownSite()  # empty, or left by a process that was killed
+    raise InputError(f"{out} exists and is not a site; choose another folder")
 
 
 def _remove(path: Path) -> None:
@@ -320,7 +324,7 @@ def _reposes(
 
 def _document(
     store: ScanStore, members: Sequence[Member], found: SiteAlignment,
-    centres_m: F64, ties: Sequence[Tie], notes: Sequence[str], known: dict[str, Any],
+    centres_m: F64, ties: Sequence[Tie], notes: Sequence[str], known: KnownSite,
 ) -> dict[str, Any]:  # fmt: skip
     frame = local_frame(store.header)
     assert frame is not None
@@ -339,7 +343,7 @@ def _document(
                 f"{pair['a']} and {pair['b']} share only {pair['ties']} tie(s): their alignment "
                 "is not sure (little overlap, another season or light)"
             )
-    revision = int(known.get("revision", 0)) + 1
+    revision = known.revision + 1
     scans = [_scan(m, found, centres_m, k) for k, m in enumerate(members)]
     moves = {s["name"]: s["T_site_scan"] for s in scans}
     return {
@@ -351,7 +355,7 @@ def _document(
         "scans": scans,
         "pairs": pairs,
         "notes": notes,
-        "history": [*known.get("history", []), {"revision": revision, "T_site_scan": moves}],
+        "history": [*known.history, {"revision": revision, "T_site_scan": moves}],
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -72,11 +72,3 @@ def placing(pairs: Sequence[Pair], site: LocalFrame) -> tuple[Similarity, F64]:
 def read_start(path: Path) -> list[Pair]:
     """The points in a JSON file. Raises InputError for anything else."""
     return read_json(path, list[Pair], MAX_BYTES, "list of points")
-
-
-def start_of(rows: list[Any], name: str) -> list[Pair]:
-    """The points in what was read from JSON; ``name`` is for the error."""
-    try:
-        return msgspec.convert(rows, list[Pair])
-    except msgspec.ValidationError as error:
-        raise InputError(f"{name} is no list of points: {error}"[:300]) from error

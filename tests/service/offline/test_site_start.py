@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from site_scans import FRAME, HEIGHT_M, Errors, leg, write_scan
@@ -16,7 +17,7 @@ from recon.types import F64
 from service.cli import app
 from service.errors import InputError
 from service.offline.site.alignment import align_site
-from service.offline.site.start import read_start, start_of
+from service.offline.site.start import Pair, read_start
 from service.stream.store import ScanStore
 
 NORTH, EAST = leg(0.0), leg(np.pi / 2)
@@ -82,7 +83,7 @@ def test_points_are_remembered_when_the_site_is_aligned_again(
     scans: tuple[Path, Path], tmp_path: Path
 ) -> None:
     placed, nowhere = scans
-    starts = {nowhere: start_of(clicks(), "points")}
+    starts = {nowhere: msgspec.convert(clicks(), list[Pair])}
     align_site([placed, nowhere], tmp_path / "site", deliver=False, starts=starts)
     again = align_site([placed], tmp_path / "site", deliver=False).document
     assert [s["name"] for s in again["scans"]] == ["placed", "nowhere"]
@@ -98,7 +99,7 @@ def test_a_scan_that_nothing_ties_stays_where_the_points_put_it(
     exact = points(ELSEWHERE.as_similarity().points(SPOTS), SPOTS)
     site = tmp_path / "site"
     document = align_site(
-        [placed, winter], site, deliver=False, starts={winter: start_of(exact, "points")}
+        [placed, winter], site, deliver=False, starts={winter: msgspec.convert(exact, list[Pair])}
     ).document
     assert document["scans"][1]["placed"] == "by its points"
     assert any("winter" in note and "its points put it" in note for note in document["notes"])
@@ -124,7 +125,7 @@ def test_points_that_place_nothing_are_refused(
     scans: tuple[Path, Path], tmp_path: Path, pairs: list[dict[str, Any]], reason: str
 ) -> None:
     placed, nowhere = scans
-    starts = {nowhere: start_of(pairs, "points")}
+    starts = {nowhere: msgspec.convert(pairs, list[Pair])}
     with pytest.raises(InputError, match=reason):
         align_site([placed, nowhere], tmp_path / "site", deliver=False, starts=starts)
     assert not (tmp_path / "site").exists()
@@ -144,7 +145,7 @@ def test_files_that_are_no_list_of_points_are_refused(tmp_path: Path, text: str)
 
 def test_a_start_for_the_wrong_scan_is_refused(scans: tuple[Path, Path], tmp_path: Path) -> None:
     placed, nowhere = scans
-    start = start_of(clicks(), "points")
+    start = msgspec.convert(clicks(), list[Pair])
     for folders, of, reason in (
         ([placed, nowhere], placed, "has a georeference"),
         ([placed], nowhere, "none of the scans"),
