@@ -30,7 +30,8 @@ from service.scans.writing import check_writable
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
-T, Of = TypeVar("T"), TypeVar("Of")
+T = TypeVar("T")
+Of = TypeVar("Of")
 
 FUSING = 0.6
 """Share of an export that fusing the cloud takes."""
