@@ -285,6 +285,22 @@ def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixt
     assert "telemetry log" in caplog.text
 
 
+def test_a_log_is_written_through_while_it_grows(tmp_path: Path) -> None:
+    """So that a power cut costs its last seconds only."""
+    port, log = free_port(), tmp_path / "link.tlog"
+    with (
+        RehearsalVehicle(f"udpin:127.0.0.1:{port}") as daemon,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
+    ):
+        daemon.link.record(log, 0)
+        peer.connect(("127.0.0.1", port))
+        beat = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(
+            dialect.MAVLink(None, 255, 1)
+        )
+        peer.send(bytes(beat))
+        until(lambda: bytes(beat) in log.read_bytes())
+
+
 def test_odometry_time_is_the_autopilots(tmp_path: Path) -> None:
     with RehearsalVehicle() as daemon:
         assert daemon.link.boot_time_us(time.monotonic_ns()) is None
