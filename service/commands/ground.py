@@ -106,8 +106,8 @@ class GroundOptions:
 
     def receiver(self) -> ReceiverConfig:
         """The receiver's configuration; InputError for impossible options."""
-        from service.ground.drone import DroneLimits
         from service.ground.receiver import ReceiverConfig
+        from service.ground.storage import DroneLimits
         from service.stream.keys import member_name, tls_files
         from service.stream.session import SessionConfig
 

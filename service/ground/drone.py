@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from service.errors import OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import Change, Files, ReceivedScan
-from service.ground.storage import DiskShare, drone_folder, scan_folder
+from service.ground.storage import DiskShare, DroneLimits, drone_folder, scan_folder
 from service.stream.messages import Ask, Head, count, pack, unpack
 from service.stream.naming import ROOT
 from service.stream.radio_messages import RADIO_NOTE
@@ -41,24 +38,6 @@ MAX_INTRODUCTIONS = 32
 MAX_CLOSED = 200
 """Closed scans whose last figures are kept."""
 UNREADABLE_REST_S, MAX_UNREADABLE = 60.0, 64
-
-
-@dataclass(frozen=True, slots=True)
-class DroneLimits:
-    """Limits of the drones at the ground station, each for one drone unless it says otherwise."""
-
-    scan_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers
-    drone_share: float = 0.5  # of the disk
-    reserve_bytes: int | None = None  # that stay free on the disk; None: by its size
-    drones: int = 64  # received at once, of all; more wait until one is silent
-    open_scans: int = 32  # where the descriptors allow it
-    unfinished_bytes: int = 1 << 25  # of records; beyond it the largest make way
-    silent_s: float = 30.0  # without a message for so long, it is silent
-    close_whole_s: float = 60.0  # a whole scan without data for so long is written and closed
-    full_disk_rest_s: float = 10.0  # until a full disk is tried again
-    refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
-    look_s: float = 1.0  # between two looks at the disk
-    usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage  # of a folder's disk
 
 
 class Item(NamedTuple):
@@ -142,10 +121,7 @@ class DroneReceiver:
         self._closed: OrderedDict[str, dict[str, Any]] = OrderedDict()
         self._introductions: OrderedDict[str, Introduction] = OrderedDict()
         self._unreadable: OrderedDict[str, float] = OrderedDict()  # until when
-        self._share = DiskShare(
-            drone_folder(store, drone), limits.drone_share, limits.reserve_bytes, limits.usage,
-            limits.look_s,
-        )  # fmt: skip
+        self._share = DiskShare(drone_folder(store, drone), limits)
         self._shown_at = self._refresh_at = -1e9
         self._effects: list[Effect] = []
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, outside
-from service.ground import drone
 from service.ground.basemap import open_basemap
 from service.ground.guard import (
     MAX_BODY_BYTES,
@@ -27,6 +26,7 @@ from service.ground.library import Library
 from service.ground.live_map import LiveMap
 from service.ground.meshing import queue_mesh
 from service.ground.state import REFINE, Job, Jobs, OpenScans, PortalState
+from service.ground.storage import DroneLimits
 from service.ground.vehicle import Vehicle
 from service.listener import (
     BoundedListener,
@@ -57,7 +57,7 @@ class PortalConfig:
     token: str = ""  # one, or lines of NAME TOKEN; empty: made at the start, only on this machine
     tls: tuple[Path, Path] | None = None  # certificate and key
     basemap: Path | None = None  # an MBTiles or PMTiles file
-    limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)  # of the disk
+    limits: DroneLimits = field(default_factory=DroneLimits)  # of the disk
     map_age_s: float = 1.0  # at which the live map of a scan is made again
     coverage_age_s: float = 2.0  # the same for its coverage
     meshes: bool = False  # make the mesh of each scan that ends

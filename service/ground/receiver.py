@@ -30,6 +30,7 @@ from service.errors import InputError, SkyreliefError
 from service.ground import drone
 from service.ground.front import behind_fronts
 from service.ground.received import ReceivedScan, deliver, folders_due, write_files
+from service.ground.storage import DroneLimits
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
@@ -67,7 +68,7 @@ class ReceiverConfig:
 
     store: Path
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
-    limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)
+    limits: DroneLimits = field(default_factory=DroneLimits)
     name: str = ""  # of this station; empty: made once and kept in the store
 
 

@@ -19,9 +19,8 @@ import numpy as np
 
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.ground.drone import DroneLimits
 from service.ground.scan_facts import Corner, Ground, Times, ground_in
-from service.ground.storage import DiskShare, is_regular, scan_files
+from service.ground.storage import DiskShare, DroneLimits, is_regular, scan_files
 from service.offline.site import DRONE, SAME_VISIT_S, SITE
 from service.offline.site.start import Pair
 from service.progress import Progress
@@ -85,7 +84,7 @@ class Sites:
 def _check_room(store: Path, limits: DroneLimits, members: Sequence[Path]) -> None:
     """Raise OutsideError when a site of these scans does not fit the sites' share of the disk."""
     sizes = (path.stat().st_size for m in members for path in m.glob("scan.db*"))
-    share = DiskShare(store / DRONE, limits.drone_share, limits.reserve_bytes)
+    share = DiskShare(store / DRONE, limits)
     share.check(SIZES * sum(sizes))
 
 

@@ -18,9 +18,9 @@ from starlette.requests import HTTPConnection
 
 from service.errors import InputError, MissingError, SkyreliefError
 from service.ground.basemap import Basemap
-from service.ground.drone import DroneLimits
 from service.ground.library import Library
 from service.ground.live_map import LiveMap
+from service.ground.storage import DroneLimits
 from service.ground.vehicle import Vehicle
 from service.offline.exports import EXPORTERS
 from service.offline.exports.view import ExportOptions, ScanView, export

@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, cast
 
@@ -36,23 +37,32 @@ RESERVE_SHARE, MAX_RESERVE_BYTES = 0.05, 2 << 30
 MEASURE_S = 60.0
 
 
+@dataclass(frozen=True, slots=True)
+class DroneLimits:
+    """Limits of the drones at the ground station, each for one drone unless it says otherwise."""
+
+    scan_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers
+    drone_share: float = 0.5  # of the disk
+    reserve_bytes: int | None = None  # that stay free on the disk; None: by its size
+    drones: int = 64  # received at once, of all; more wait until one is silent
+    open_scans: int = 32  # where the descriptors allow it
+    unfinished_bytes: int = 1 << 25  # of records; beyond it the largest make way
+    silent_s: float = 30.0  # without a message for so long, it is silent
+    close_whole_s: float = 60.0  # a whole scan without data for so long is written and closed
+    full_disk_rest_s: float = 10.0  # until a full disk is tried again
+    refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
+    look_s: float = 1.0  # between two looks at the disk
+    usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage  # of a folder's disk
+
+
 class DiskShare:
     """Space that one drone may still use; use from one thread.
 
     Everything in the drone's folder counts: coarse layers, poses and deliverables too.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        share: float,
-        reserve_bytes: int | None,
-        usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage,
-        look_s: float = 1.0,
-    ) -> None:
-        """``usage`` gives total, used and free bytes of a folder's disk, asked every ``look_s``."""
-        self._folder, self._usage, self._look_s = folder, usage, look_s
-        self._share, self._reserve_bytes = share, reserve_bytes
+    def __init__(self, folder: Path, limits: DroneLimits) -> None:
+        self._folder, self._limits = folder, limits
         self._used_bytes, self._measured_at = 0, -1e9
         self._total_bytes, self._free_bytes, self._looked_at = 0, 0, -1e9
 
@@ -63,12 +73,12 @@ class DiskShare:
         """
         now = time.monotonic() if now is None else now
         self._look(now)
-        if self._used_bytes + size_bytes > self._share * self._total_bytes:
+        share, reserve_bytes = self._limits.drone_share, self._limits.reserve_bytes
+        if self._used_bytes + size_bytes > share * self._total_bytes:
             raise OutsideError(
-                f"{self._folder} has reached its share, {100 * self._share:g} % of the disk; "
+                f"{self._folder} has reached its share, {100 * share:g} % of the disk; "
                 "delete scans or give --drone-share"
             )
-        reserve_bytes = self._reserve_bytes
         if reserve_bytes is None:
             reserve_bytes = min(int(RESERVE_SHARE * self._total_bytes), MAX_RESERVE_BYTES)
         if self._free_bytes - size_bytes < reserve_bytes:
@@ -81,10 +91,10 @@ class DiskShare:
 
     def _look(self, now: float) -> None:
         """Measure the disk, and now and then the folder: others write there too."""
-        if now - self._looked_at >= self._look_s:
+        if now - self._looked_at >= self._limits.look_s:
             self._looked_at = now
             with outside(f"cannot read the disk of {self._folder}"):
-                self._total_bytes, _, self._free_bytes = self._usage(existing(self._folder))
+                self._total_bytes, _, self._free_bytes = self._limits.usage(existing(self._folder))
         if now - self._measured_at >= MEASURE_S:
             self._measured_at = now
             self._used_bytes = folder_bytes(self._folder)

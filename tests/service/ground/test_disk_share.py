@@ -8,12 +8,15 @@ from pathlib import Path
 import pytest
 
 from service.errors import OutsideError
-from service.ground.storage import DiskShare, folder_bytes
+from service.ground.storage import DiskShare, DroneLimits, folder_bytes
 
 
 def test_share_and_reserve_hold_to_the_byte(tmp_path: Path) -> None:
     def share_of(name: str, share: float, reserve_bytes: int | None) -> DiskShare:
-        return DiskShare(tmp_path / name, share, reserve_bytes, lambda _: (10_000, 7_000, 3_000))
+        limits = DroneLimits(
+            drone_share=share, reserve_bytes=reserve_bytes, usage=lambda _: (10_000, 7_000, 3_000)
+        )
+        return DiskShare(tmp_path / name, limits)
 
     (tmp_path / "red" / "scan").mkdir(parents=True)
     (tmp_path / "red" / "scan" / "scan.db").write_bytes(bytes(4_000))

@@ -25,7 +25,6 @@ from hypothesis.stateful import (
 from service.ground.drone import (
     REWRITE_S,
     Answered,
-    DroneLimits,
     DroneReceiver,
     Effect,
     Event,
@@ -37,6 +36,7 @@ from service.ground.drone import (
     Written,
 )
 from service.ground.received import TRANSITIONS, Change, Files
+from service.ground.storage import DroneLimits
 from service.stream import codec
 from service.stream.messages import Head, Held, pack, split, unpack
 from service.stream.naming import place_of

@@ -23,7 +23,7 @@ from loopback import free_port, until
 from paths import ROOT
 
 from service.config import DatalinkConfig
-from service.ground.drone import Answered, DroneLimits, DroneReceiver, Item
+from service.ground.drone import Answered, DroneReceiver, Item
 from service.ground.received import ReceivedScan
 from service.ground.receiver import (
     MAX_HEADS,
@@ -33,6 +33,7 @@ from service.ground.receiver import (
     Receiver,
     ReceiverConfig,
 )
+from service.ground.storage import DroneLimits
 from service.stream.link import DatalinkSender
 from service.stream.messages import split
 from service.stream.records import PoseRecord, ScanHeader

@@ -19,9 +19,8 @@ from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.config import DatalinkConfig
 from service.errors import InputError, OutsideError
-from service.ground.drone import DroneLimits
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.ground.storage import scan_folder
+from service.ground.storage import DroneLimits, scan_folder
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, Repose, ScanHeader

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from site_scans import Errors, leg, write_scan
 
-from service.ground.drone import DroneLimits
 from service.ground.sites import Sites, companions, site_of
+from service.ground.storage import DroneLimits
 from service.offline.site.alignment import align_site
 from service.scans.folder import write_deliverables
 from service.stream.store import ScanStore

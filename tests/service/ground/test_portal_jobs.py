@@ -17,9 +17,9 @@ from loopback import until
 from person import Browser
 from portal_client import NEEDS, ONE, TOKEN, Client, browser, flown_store
 
-from service.ground.drone import DroneLimits
 from service.ground.portal import Portal, PortalConfig
 from service.ground.state import Job
+from service.ground.storage import DroneLimits
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
