@@ -148,7 +148,6 @@ class Receiver:
         self.limits, self.workers = config.limits, workers or Workers()
         self._session: zenoh.Session | None = None
         self._session_config = config.session
-        self._takers: list[Worker] = []  # each ends with its request, or with the session
         self._lock = threading.RLock()  # of the table of drones, and of the radio
         self._drones: dict[str, Drone] = {}  # the last begun last
         self._tunnel = TunnelIntake()
@@ -229,10 +228,9 @@ class Receiver:
             finally:
                 self._session = None
                 session.close()
-                with self._lock:
-                    takers = self._takers
-                for taker in takers:
-                    taker.join()
+                for taker in self.workers.table():  # each ends with its request, or the session
+                    if taker.row.name == "messages":
+                        taker.join()
 
     def _serve(self, session: zenoh.Session, worker: Worker) -> None:
         """Have messages taken until the stop, or until the session ends."""
@@ -269,10 +267,7 @@ class Receiver:
                     self._take(str(sample.key_expr), sample.payload.to_bytes())
             ended()
 
-        with self._lock:
-            taker = self.workers.start(f"messages {name}", work)
-            self._takers = [*(t for t in self._takers if not t.is_done), taker]
-        return taker
+        return self.workers.start(f"messages {name}", work)
 
     def _take(self, key: str, payload: bytes) -> None:
         """Hand on what a drone has sent."""
