@@ -169,10 +169,10 @@ class LinkEmulator:
             writer.close()
             return
         await asyncio.gather(
-            self._relay(reader, far_writer, self._up), self._relay(far_reader, writer, self._down)
+            self.relay(reader, far_writer, self._up), self.relay(far_reader, writer, self._down)
         )
 
-    async def _relay(
+    async def relay(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pipe: Direction
     ) -> None:
         """Carry one direction until its sender is done.

@@ -197,7 +197,7 @@ class Scan:
         assert isinstance(posed, FramePosed)
         self.check.add(time_ns, posed.frame)
         self.tracking.look(posed.frame, time_ns)
-        self._report_blur()
+        self.report_blur()
         for doubt in self.pipeline.new_doubts():
             inputs.warn(doubt)
         self.recorder.write(events, state.alt_agl_m if state is not None else None)
@@ -214,7 +214,7 @@ class Scan:
         odometry = self.mapper.odometry
         return motion_blur(odometry.exposure, float(self.inputs.camera.K[0, 0] / odometry.K[0, 0]))
 
-    def _report_blur(self) -> None:
+    def report_blur(self) -> None:
         """Report to the operator once that the shutter is too slow for the speed."""
         if not self._is_blur_reported and (blur := self.motion_blur) is not None:
             self._is_blur_reported = True

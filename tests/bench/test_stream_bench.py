@@ -48,7 +48,7 @@ def test_a_stream_with_losses_keeps_its_order_and_its_last_bytes() -> None:
         reader = asyncio.StreamReader()
         reader.feed_data(bytes(20 * 1400))
         reader.feed_eof()
-        await emulator._relay(reader, Mock(), emulator._up)
+        await emulator.relay(reader, Mock(), Direction(model, years_s, model.seed))
 
     asyncio.run(relay())
     assert len(at_s) == 21  # the end comes after the last bytes

@@ -120,7 +120,7 @@ def test_a_client_that_is_dropped_while_others_are_read_ends_nothing() -> None:
         contextlib.closing(TcpPort(at)) as port,
         socket.create_connection((at.place, at.number)) as client,
     ):
-        until(lambda: port.read() or port._peers)
+        until(lambda: port.read() or port.ways)
         gone = socket.socket()
         gone.close()  # as the writing thread closes one
         port._peers.append(gone)

@@ -122,7 +122,7 @@ def test_the_operator_hears_once_that_the_shutter_is_too_slow() -> None:
     scan = Mock(Scan, inputs=Mock(ScanInputs, warn=warnings.append), _is_blur_reported=False)
     for blur_px in (None, 9.4, 12.1):
         scan.motion_blur = blur_px and {"blur_px": blur_px, "exposure_ms": 20.0}
-        Scan._report_blur(scan)
+        Scan.report_blur(scan)
     assert warnings == ["Shutter too slow: images blur by 9 px"]
     assert len(warnings[0]) <= 50, "characters that a ground station shows"
 
