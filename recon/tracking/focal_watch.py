@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from recon.tracking.bundle import BundleResult, linearise_all
 from recon.types import F64, I64
@@ -92,17 +91,23 @@ def _not_taken_up(
 
     ``by_pose`` (M, 2, 6) and ``by_point`` (M, 2, 3) are the derivatives.
     """
-    unknowns = np.hstack(
-        [6 * cam[:, None] + np.arange(6), 6 * C + 3 * point[:, None] + np.arange(3)]
+    rows, flat = np.arange(len(cam) + 1), values.reshape(-1, values.shape[2])
+    P = sparse.bsr_array((by_pose, cam, rows), (len(flat), 6 * C))
+    X = sparse.bsr_array((by_point, point, rows), (len(flat), 3 * N))
+    of_point = np.zeros((N, 3, 3))
+    np.add.at(of_point, point, np.einsum("mki,mkj->mij", by_point, by_point))
+    ridge = 1e-9 * np.trace(of_point, axis1=1, axis2=2) + 1e-9  # far points have no depth
+    inverse = np.linalg.inv(of_point + ridge[:, None, None] * np.eye(3))
+    # Points are eliminated: to factor all unknowns at once takes 40 MB.
+    both = (X.T @ P).toarray()
+    eliminated = sparse.bsr_array((inverse, np.arange(N), np.arange(N + 1))) @ both
+    reduced = (P.T @ P).toarray() - both.T @ eliminated
+    of_points = X.T @ flat
+    poses = np.linalg.pinv(reduced, rcond=1e-9, hermitian=True) @ (  # place, turn, scale are open
+        P.T @ flat - eliminated.T @ of_points
     )
-    columns, flat = np.repeat(unknowns, 2, axis=0), values.reshape(-1, values.shape[2])
-    entries, starts = np.concatenate([by_pose, by_point], axis=2), np.arange(len(columns) + 1) * 9
-    shape = len(columns), 6 * C + 3 * N
-    J = sparse.csr_matrix((entries.ravel(), columns.ravel(), starts), shape)
-    H = (J.T @ J).tocsc()
-    # Place, turn and scale are open, and so are the depths of far points.
-    H += sparse.diags_array(1e-9 * H.diagonal() + 1e-12)
-    taken = J @ splu(H, permc_spec="MMD_AT_PLUS_A").solve(J.T @ flat)
+    rest = (of_points - both @ poses).reshape(N, 3, -1)
+    taken = P @ poses + X @ (inverse @ rest).reshape(3 * N, -1)
     return np.asarray(values - taken.reshape(values.shape))
 
 
