@@ -42,8 +42,6 @@ ASK_TIMEOUT_S = 120.0
 RETRY_S, LOOK_AROUND_S, LOOK_S = 1.0, 3.0, 0.2
 CHANNEL = 256
 """Messages that may wait in the session, of one kind or to one request."""
-MAX_REQUESTS = 1024
-"""Requests under way, each with a thread, of all drones; each drone may have an equal share."""
 TICK_S, MAX_REST_S = 0.1, 0.5
 """After each turn a drone's worker rests as long as it computed, at most so long: one drone never
 takes more than half of a core."""
@@ -384,7 +382,7 @@ class Receiver:
             return
         if isinstance(effect, drone.Get):
             one.requests = [taker for taker in one.requests if not taker.is_done]
-            if len(one.requests) >= MAX_REQUESTS // max(1, len(self._busy)):
+            if len(one.requests) >= self.limits.requests // max(1, len(self._busy)):
                 one.put(effect.answered)
                 return
         try:

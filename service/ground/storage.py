@@ -45,6 +45,7 @@ class DroneLimits:
     drone_share: float = 0.5  # of the disk
     reserve_bytes: int | None = None  # that stay free on the disk; None: by its size
     drones: int = 64  # received at once, of all; more wait until one is silent
+    requests: int = 1024  # under way, of all; each takes a thread, each drone an equal share
     open_scans: int = 32  # where the descriptors allow it
     unfinished_bytes: int = 1 << 25  # of records; beyond it the largest make way
     silent_s: float = 30.0  # without a message for so long, it is silent

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from onboard import MODEL, Onboard
 from paths import ROOT
+from spied import spied
 
 from mavlink.component.vehicle import VehicleLink
 from service.background import BackgroundWorker
@@ -103,15 +104,14 @@ def test_kernels_that_cannot_be_loaded_leave_the_rest_of_housekeeping(
     def fails() -> None:
         raise RuntimeError("no cache")
 
-    daemon, kept = Onboard(tmp_path), list[Path]()
+    daemon, kept = Onboard(tmp_path), spied(monkeypatch, runtime, "make_room")
     monkeypatch.setattr(runtime, "load_kernels", fails)
-    monkeypatch.setattr(runtime, "make_room", lambda folder, *_: kept.append(folder))
     daemon.vehicle.arm()
     daemon.look()
     daemon.scanning.is_warm = True
     with pytest.raises(RuntimeError, match="no cache"):
         daemon.housekeeping()
-    assert kept == [Path(daemon.config.scan.folder)]
+    assert [call.args[0] for call in kept.call_args_list] == [Path(daemon.config.scan.folder)]
 
 
 def test_the_command_fits_the_installation() -> None:

@@ -145,15 +145,15 @@ def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(tmp_p
         assert not ground.workers.failed
 
 
-def test_a_drone_that_answers_no_request_gets_few_threads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drone_that_answers_no_request_gets_few_threads(tmp_path: Path) -> None:
     """It names ever new scans, for whose headers it is asked."""
-    monkeypatch.setattr("service.ground.receiver.MAX_REQUESTS", 20)
     kept: list[Any] = []
     names = itertools.count()
 
-    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+    with (
+        serving(tmp_path / "ground", DroneLimits(requests=20)) as (ground, endpoint),
+        hostile(endpoint) as session,
+    ):
         queryable = session.declare_queryable("skyrelief/evil/**", kept.append)
 
         def is_full() -> bool:

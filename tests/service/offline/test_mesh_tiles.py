@@ -197,16 +197,23 @@ class FakeVideo(CameraSource):
         self.closed = True
 
 
+@pytest.fixture
+def videos(monkeypatch: pytest.MonkeyPatch) -> list[FakeVideo]:
+    """The last one is what every recording opens as."""
+    given: list[FakeVideo] = []
+    monkeypatch.setattr(images, "open_camera", lambda _: given[-1])
+    return given
+
+
 def test_images_come_from_the_video_at_the_keyframes_times(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, house: HouseFlight, videos: list[FakeVideo]
 ) -> None:
     with house.flown(tmp_path) as store:
         keyframes = list(store.keyframes())
         K = np.array([[280.0, 0, 159.5], [0, 280.0, 89.5], [0, 0, 1]])
         camera = {"K": K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
-    video = FakeVideo(house)
-    monkeypatch.setattr(images, "open_camera", lambda _: video)
+    videos.append(video := FakeVideo(house))
 
     def views_of(header: ScanHeader, epoch_ns: int | None = None, **how: Any) -> list[TextureView]:
         return images.video_images(keyframes, header, tmp_path, epoch_ns, **how)
@@ -226,7 +233,7 @@ def test_images_come_from_the_video_at_the_keyframes_times(
         views_of(header, 0)
     with pytest.raises(InputError, match="no camera model"):
         views_of(replace(header, camera={}))
-    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    videos.append(FakeVideo(house, (640, 360)))
     with pytest.raises(InputError, match="640x360"):
         views_of(header)
 
@@ -257,14 +264,13 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_recording_that_a_scan_names_is_found(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, house: HouseFlight, videos: list[FakeVideo]
 ) -> None:
     folder = tmp_path / "scan"
     with house.flown(folder) as store:
         camera = {"K": [1.0] * 9, "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
-    video_px = (320, 180)
-    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, video_px))
+    videos.append(FakeVideo(house, (320, 180)))
 
     def found() -> images.Recording:
         return images.recording_of(folder, header)
@@ -300,7 +306,7 @@ def test_the_recording_that_a_scan_names_is_found(
     assert "is not there" in name("x" * 5000).words
     (folder / "scan.json").write_text("[" * 100_000)
     assert "does not name" in found().words
-    video_px = (640, 360)
+    videos.append(FakeVideo(house, (640, 360)))
     assert name("flight.mp4").path is None and "another recording" in name("flight.mp4").words
     bare = replace(header, camera={})
     assert images.recording_of(folder, bare).path is None

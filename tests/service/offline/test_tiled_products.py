@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from site_scans import Errors, leg, write_scan
+from spied import spied
 
 from recon.types import F64
 from service.offline.exports import EXPORTERS, view
@@ -19,7 +20,6 @@ from service.offline.exports.clouds import PLY_TYPES, SAMPLES_PER_SIDE, octree_i
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.site import compare
 from service.offline.site.alignment import align_site
-from service.offline.tiles import run_tiles
 
 rasterio = pytest.importorskip("rasterio")
 
@@ -30,6 +30,7 @@ pytestmark = pytest.mark.slow
 
 VOXEL_M = 0.3
 TILE_POINTS = 30_000  # the flight of the house has 72,000
+Counted = Callable[[], list[int]]
 
 
 def exported(folder: Path, kind: str, out: Path, **options: Any) -> Path:
@@ -38,26 +39,20 @@ def exported(folder: Path, kind: str, out: Path, **options: Any) -> Path:
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many tiles each raster is made of."""
-    counts: list[int] = []
-
-    def counting(make: Callable[..., Any], jobs: Any, *rest: Any) -> Any:
-        counts.append(len(jobs))
-        return run_tiles(make, jobs, *rest)
-
-    monkeypatch.setattr(view, "run_tiles", counting)
-    return counts
+def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
+    """How many tiles each raster is made of, so far."""
+    runs = spied(monkeypatch, view, "run_tiles")
+    return lambda: [len(call.args[1]) for call in runs.call_args_list]
 
 
 @pytest.mark.parametrize(("kind", "far"), [("dsm", 0.02), ("dtm", 0.05), ("ortho", 40.0)])
 def test_a_raster_in_tiles_is_that_of_the_whole(
-    tmp_path: Path, house: HouseFlight, counted: list[int], kind: str, far: float
+    tmp_path: Path, house: HouseFlight, counted: Counted, kind: str, far: float
 ) -> None:
     house.flown(tmp_path / "scan").close()
     whole = exported(tmp_path / "scan", kind, tmp_path / "whole.tif")
     parts = exported(tmp_path / "scan", kind, tmp_path / "parts.tif", tile_points=TILE_POINTS)
-    assert counted and counted[0] > 2
+    assert counted() and counted()[0] > 2
     with rasterio.open(whole) as one, rasterio.open(parts) as two:
         assert one.crs == two.crs and one.res == two.res and one.descriptions == two.descriptions
         rows = round((two.transform.f - one.transform.f) / one.res[0])
@@ -88,14 +83,14 @@ def test_points_in_tiles_are_those_of_the_whole(tmp_path: Path, house: HouseFlig
 
 @pytest.mark.parametrize("kind", ["ply", "copc"])
 def test_a_cloud_in_tiles_is_that_of_the_whole(
-    tmp_path: Path, house: HouseFlight, counted: list[int], kind: str
+    tmp_path: Path, house: HouseFlight, counted: Counted, kind: str
 ) -> None:
     pytest.importorskip("copclib")
     house.flown(tmp_path / "scan").close()
     usual = EXPORTERS[kind][1]
     whole = exported(tmp_path / "scan", kind, tmp_path / usual)
     tiled = exported(tmp_path / "scan", kind, tmp_path / f"2-{usual}", tile_points=TILE_POINTS)
-    assert counted and counted[0] > 2
+    assert counted() and counted()[0] > 2
     one, two = places_in(whole), places_in(tiled)
     assert abs(len(two) - len(one)) < 0.003 * len(one)
     assert np.mean(cKDTree(one).query(two)[0] < 0.02) > 0.99
@@ -112,14 +107,14 @@ def places_in(path: Path) -> F64:
     return np.column_stack([rows["x"], rows["y"], rows["z"]])
 
 
-def test_contours_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: list[int]) -> None:
+def test_contours_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: Counted) -> None:
     write_scan(tmp_path / "scan", leg(0.0, 8))
     whole, parts = (
         contours_in(exported(tmp_path / "scan", "contours", tmp_path / f"{points}.geojson",
                              tile_points=points, contour_m=0.3))
         for points in (20_000_000, 60_000)
     )  # fmt: skip
-    assert counted and counted[0] > 2 and len(parts) > len(whole) > 4
+    assert counted() and counted()[0] > 2 and len(parts) > len(whole) > 4
     tops = np.unique([line[0, 2] for line in whole])
     assert np.array_equal(np.unique([line[0, 2] for line in parts]), tops)
     one, two = np.concatenate(whole), np.concatenate(parts)
@@ -140,12 +135,12 @@ def contours_in(path: Path) -> list[F64]:
 
 
 def test_3d_tiles_of_a_site_in_tiles_hold_all_points(
-    tmp_path: Path, house: HouseFlight, counted: list[int]
+    tmp_path: Path, house: HouseFlight, counted: Counted
 ) -> None:
     tileset = pytest.importorskip("py3dtiles.tileset.tileset")
     house.flown(tmp_path / "scan").close()
     folder = exported(tmp_path / "scan", "3dtiles", tmp_path / "t", tile_points=TILE_POINTS)
-    assert counted and counted[0] > 2
+    assert counted() and counted()[0] > 2
     tiles = tileset.TileSet.from_file(folder / "tileset.json").root_tile.get_all_children()
     leaves = [t.get_or_fetch_content(folder) for t in tiles if not t.children]
     held = sum(content.body.feature_table.header.points_length for content in leaves)
@@ -154,7 +149,7 @@ def test_3d_tiles_of_a_site_in_tiles_hold_all_points(
 
 
 def test_the_files_of_a_site_in_tiles_are_those_of_the_whole(
-    tmp_path: Path, counted: list[int]
+    tmp_path: Path, counted: Counted
 ) -> None:
     scans = [write_scan(tmp_path / f"{k}", leg(k * np.pi / 2), day=k) for k in range(2)]
     clouds_of, facts = [], []
@@ -163,7 +158,7 @@ def test_the_files_of_a_site_in_tiles_are_those_of_the_whole(
         clouds_of.append(laspy.read(tmp_path / name / "cloud.laz"))
         facts.append(json.loads((tmp_path / name / "scan.json").read_text()))
         assert facts[-1]["failed"] == {} and (tmp_path / name / "report.html").is_file()
-    assert len(counted) == 1 and counted[0] > 1
+    assert len(counted()) == 1 and counted()[0] > 1
     one, two = (np.asarray(cloud.xyz) for cloud in clouds_of)
     assert len(two) == pytest.approx(len(one), rel=0.003)
     assert len(two) == facts[1]["counts"]["points"]
@@ -209,7 +204,7 @@ def test_a_cluster_makes_the_same_raster(tmp_path: Path, house: HouseFlight) -> 
         np.testing.assert_array_equal(one.read(), two.read())
 
 
-def test_changes_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: list[int]) -> None:
+def test_changes_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: Counted) -> None:
     box, gone = (-1.0, 4.0, 1.5, 7.0, 1.5), (-2.0, -9.0, 1.0, -6.5, 1.5)
     one = write_scan(tmp_path / "one", leg(0.0), boxes=[gone])
     two = write_scan(tmp_path / "two", leg(0.0), Errors((0.3, 0.0, 0.1)), boxes=[box], day=1)
@@ -222,7 +217,7 @@ def test_changes_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: list[i
             options = ExportOptions(cell_m=0.25, tile_points=points)
             done = compare.changes(view, tmp_path / name, (parts[0], parts[1]), options)
             found.append(done)
-    assert counted[0] > 1
+    assert counted()[0] > 1
     whole, tiled = (sorted(f.objects, key=lambda o: o.body.volume_m3) for f in found)
     assert [o.about["kind"] for o in whole] == ["removed", "added"]
     assert [o.about["kind"] for o in tiled] == ["removed", "added"]
