@@ -14,7 +14,6 @@ from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from service.errors import InputError
@@ -22,7 +21,7 @@ from service.georeference import LocalFrame
 from service.ground.scan_facts import Corner, Ground, Times, ground_in
 from service.ground.storage import DiskShare, DroneLimits, is_regular, scan_files
 from service.offline.site import DRONE, SAME_VISIT_S, SITE
-from service.offline.site.start import Pair
+from service.offline.site.start import KnownSite, Pair
 from service.progress import Progress
 from service.small_file import read_json
 from service.workers import Worker, guarded, python_command, run_to_end
@@ -172,19 +171,11 @@ def site_of(store: Path, members: Sequence[Path]) -> Path:
     return store / DRONE / f"{first.parent.name}-{first.name}"[:100]
 
 
-class _Scan(msgspec.Struct):
-    folder: str
-
-
-class _Site(msgspec.Struct):
-    scans: list[_Scan]
-
-
 def _sites(store: Path) -> Iterator[tuple[Path, set[Path]]]:
     """The folders of the sites, each with those of its scans."""
     for path in sorted((store / DRONE).glob(f"*/{SITE}")):
         with contextlib.suppress(InputError):
-            site = read_json(path, _Site, MAX_SITE_BYTES, "site")
+            site = read_json(path, KnownSite, MAX_SITE_BYTES, "site")
             yield path.parent, {Path(scan.folder) for scan in site.scans}
 
 

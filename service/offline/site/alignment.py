@@ -34,7 +34,7 @@ from service.offline.refine.stored_loops import BREAK_S, stored_loops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
 from service.offline.site.start import SIGMA_SCALE as START_SCALE
-from service.offline.site.start import Pair
+from service.offline.site.start import KnownSite, Pair
 from service.progress import Progress
 from service.scans.folder import resolution_m, write_deliverables
 from service.scans.fused_cloud import TiledCloud
@@ -166,19 +166,6 @@ def _align(
         if not any(out.iterdir()):
             out.rmdir()
     return AlignedSite(out, members, found, document)
-
-
-class KnownScan(msgspec.Struct):
-    folder: str
-    start: list[Pair] | None = None
-
-
-class KnownSite(msgspec.Struct):
-    """What an alignment takes from the document of the one before it."""
-
-    scans: list[KnownScan] = []
-    revision: int = 0
-    history: list[dict[str, Any]] = []
 
 
 def _known(out: Path) -> KnownSite:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -40,6 +40,19 @@ class Pair(msgspec.Struct, forbid_unknown_fields=True):
         Annotated[float, msgspec.Meta(ge=-85, le=85)],
         Annotated[float, msgspec.Meta(ge=-1000, le=20_000)],
     ]
+
+
+class KnownScan(msgspec.Struct):
+    folder: str
+    start: list[Pair] | None = None
+
+
+class KnownSite(msgspec.Struct):
+    """What an alignment takes from the document of the one before it."""
+
+    scans: list[KnownScan] = []
+    revision: int = 0
+    history: list[dict[str, Any]] = []
 
 
 def placing(pairs: Sequence[Pair], site: LocalFrame) -> tuple[Similarity, F64]:
