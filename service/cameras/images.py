@@ -11,6 +11,7 @@ from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -222,12 +223,7 @@ class ImagesSource(CameraSource):
             f"{len(known) - known.count(usual)} altitudes are above another datum than the others' "
             f"({usual or 'not stated'}): not used"
         )
-        return [
-            (path, replace(tags, geotag=replace(tags.geotag, alt_amsl_m=None)))
-            if tags.geotag is not None and tags.geotag.datum != usual
-            else (path, tags)
-            for path, tags in tagged
-        ]
+        return without(tagged, lambda tag: tag.datum != usual, alt_amsl_m=None)
 
     def _same_size(self, tagged: list[Still]) -> list[Still]:
         """Stills of the size taken at most moments, as stored or turned by a quarter: a camera
@@ -297,10 +293,7 @@ class ImagesSource(CameraSource):
             f"the images head {median(pans):.0f} degrees off the aircraft's nose: their headings "
             "are not used"
         )
-        return [
-            (path, replace(tags, geotag=tags.geotag and replace(tags.geotag, is_yaw_known=False)))
-            for path, tags in tagged
-        ]
+        return without(tagged, lambda tag: True, is_yaw_known=False)
 
     def _places(self, tagged: list[Still], times_ns: list[int]) -> list[Still]:
         """The stills without positions from which no aircraft reaches most of its flight in time.
@@ -309,30 +302,23 @@ class ImagesSource(CameraSource):
         """
         from service.georeference import LocalFrame
 
-        fixes = {
-            i: (tags.geotag.lat_deg, tags.geotag.lon_deg, 0.0)
-            for i, (_, tags) in enumerate(tagged)
-            if tags.geotag is not None and tags.geotag.lat_deg is not None
-        }
+        pairs = zip((tags.geotag for _, tags in tagged), times_ns, strict=True)
+        fixes = [(tag, ns) for tag, ns in pairs if tag is not None and tag.lat_deg is not None]
         if not fixes:
             return tagged
-        places = np.array(list(fixes.values()), np.float64)
-        enu_m, at_s = LocalFrame(*places[0]).to_enu(places), 1e-9 * np.array(times_ns)[list(fixes)]
+        places = np.array([(tag.lat_deg, tag.lon_deg, 0.0) for tag, _ in fixes], np.float64)
+        enu_m, at_s = LocalFrame(*places[0]).to_enu(places), 1e-9 * np.array([t for _, t in fixes])
         few = slice(None, None, len(fixes) // MAX_COMPARED + 1)
         apart_m = np.linalg.norm(enu_m[:, None] - enu_m[few], axis=2)
         apart_s = np.abs(at_s[:, None] - at_s[few])
         is_near = apart_s < ONE_FLIGHT_S
         is_far = is_near & (apart_m > NEAR_M + FASTEST_M_S * apart_s)
         most = np.count_nonzero(is_near, axis=1) / 2
-        wild = {i for i, far in zip(fixes, is_far.sum(axis=1) > most, strict=True) if far}
+        is_wild = is_far.sum(axis=1) > most
+        wild = {id(tag) for (tag, _), far in zip(fixes, is_wild, strict=True) if far}
         if wild:
             self._warn(f"{len(wild)} positions are far off all others: not used")
-        return [
-            (path, replace(tags, geotag=replace(tags.geotag, lat_deg=None, lon_deg=None)))
-            if i in wild and tags.geotag is not None
-            else (path, tags)
-            for i, (path, tags) in enumerate(tagged)
-        ]
+        return without(tagged, lambda tag: id(tag) in wild, lat_deg=None, lon_deg=None)
 
     def _turn(self, tagged: list[Still]) -> int:
         """Rotation in degrees clockwise for all stills, by their tags.
@@ -412,6 +398,16 @@ def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
         raise InputError(f"images: hemisphere must be NE, NW, SE or SW, not {hemisphere!r}")
     geo = Path(options["geo"]) if "geo" in options else None
     return ImagesSource(folder, interval_s, options.get("camera", ""), hemisphere, geo)
+
+
+def without(tagged: list[Still], is_meant: Callable[[GeoTag], bool], **values: Any) -> list[Still]:
+    """The stills; those whose tag of place and attitude is meant have these values in it."""
+    return [
+        (path, replace(tags, geotag=replace(tags.geotag, **values)))
+        if tags.geotag is not None and is_meant(tags.geotag)
+        else (path, tags)
+        for path, tags in tagged
+    ]
 
 
 def size_of(tags: Tags) -> str:
