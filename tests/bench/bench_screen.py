@@ -51,7 +51,7 @@ SETTING = """(() => {
   for (const kind of ['input', 'change'])
     field.dispatchEvent(new Event(kind, { bubbles: true }));
 })()"""
-WAIT_S, TRIES = 180.0, 8
+WAIT_S, TRIES = 600.0, 8
 LIMIT_S = 900.0
 """No further frame is begun after so long: software rendering is slow on a busy machine."""
 

@@ -145,6 +145,7 @@ export class Cloud implements Gradual {
   private measured = false;
   private groundStale = false;
   private groundAt = -Infinity;
+  private isNew = false; // what came last was in no frame yet: that is first
   private scaledAt = -Infinity;
   private readonly shared = {
     size: { value: 1.3 },
@@ -193,7 +194,7 @@ export class Cloud implements Gradual {
   /** Adds a keyframe, in place of the one with the same number; of one that is withdrawn nothing stays. */
   add(chunk: Chunk): void {
     this.remove(chunk.seq);
-    this.groundStale = true;
+    this.groundStale = this.isNew = true;
     if (isVoid(chunk)) return;
     const { xyz, rgb, sigma, views, unit_m } = pointsOf(chunk);
     const geometry = new THREE.BufferGeometry();
@@ -317,7 +318,7 @@ export class Cloud implements Gradual {
 
   /** Takes what has come into the ground, and into the earlier date when that is shown; true when it is news. */
   refresh(): boolean {
-    const grew = this.groundStale && this.ground.mesh.visible && performance.now() - this.groundAt > GROUND_MS;
+    const grew = this.groundStale && !this.isNew && this.ground.mesh.visible && performance.now() - this.groundAt > GROUND_MS;
     if (grew) {
       this.groundStale = false;
       this.ground.build(this.samples);
@@ -440,6 +441,7 @@ export class Cloud implements Gradual {
   /** The camera, and half the height of what it draws into, pixels of the screen. */
   screen(camera: THREE.PerspectiveCamera, half_px: number): void {
     this.camera = camera;
+    this.isNew = false;
     this.shared.height_px.value = half_px;
   }
 
