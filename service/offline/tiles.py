@@ -81,9 +81,8 @@ def tiling(
             prints, _ = extents_of(fresh, Progress())
     if not prints:
         return Tiling((Tile(name, EVERYWHERE, EVERYWHERE, tuple(seqs)),))
-    placed = [
-        replace(p, box=box_around(p.box, None if frame is None else frame.to_utm)) for p in prints
-    ]
+    to_map, from_map = (None, None) if frame is None else (frame.to_utm, frame.from_utm)
+    placed = [replace(p, box=box_around(p.box, to_map)) for p in prints]
     cut = Tiling((), tuple(placed))
     margin_m = max(margin_m, MARGIN_VOXELS * (voxel_m or cut.sample_m))
     bounds = grown(cut.bounds, margin_m)
@@ -92,7 +91,7 @@ def tiling(
         wide = box
         if box != EVERYWHERE:
             inner = np.clip(grown(box, margin_m), np.tile(bounds[:2], 2), np.tile(bounds[2:], 2))
-            wide = box_around(inner, None if frame is None else frame.from_utm)
+            wide = box_around(inner, from_map)
         own = tuple(p.seq for p in prints if overlap(p.box, wide))
         tiles.append(Tile(name, box, wide, own))
     return replace(cut, tiles=tuple(tiles))

@@ -131,6 +131,7 @@ SAMPLES_PER_SIDE = 128
 
 LEAF_POINTS = 20_000
 DEEPEST = 16
+MASK = (1 << 21) - 1  # of one axis in the number of a cell
 MAX_SHARED_LEVELS = 5
 """Above nodes that are made by themselves: the cells taken there are held, at most millions."""
 LEGACY_COUNTS_AT, FIRST_RETURNS_AT = 107, 255
@@ -218,9 +219,7 @@ def octree_in_parts(
         node[some] = _packed(unit, 2**levels, MAX_SHARED_LEVELS)
     for depth in range(levels):
         rows = np.flatnonzero(level == depth)
-        unit = (xyz[rows] - low) / side
-        corners = np.floor(unit * 2**depth).astype(np.int64)
-        yield from _nodes(depth, corners, _packed(unit, 2**depth), rows)
+        yield from _nodes(depth, _packed((xyz[rows] - low) / side, 2**depth), rows)
     lower = level == levels
     for one in np.unique(node[lower]):
         yield from octree(xyz, low, side, np.flatnonzero(lower & (node == one)), levels)
@@ -257,7 +256,6 @@ def octree(
     for depth in range(first_depth, DEEPEST + 1):
         if not len(rows):
             return
-        node = np.floor(unit * 2**depth).astype(np.int64)
         key = _packed(unit, 2**depth)
         _, which, count = np.unique(key, return_inverse=True, return_counts=True)
         stays = count[which] <= LEAF_POINTS
@@ -265,16 +263,16 @@ def octree(
             stays[:] = True
         _, first = np.unique(_packed(unit, 2**depth * SAMPLES_PER_SIDE), return_index=True)
         stays[first] = True
-        yield from _nodes(depth, node[stays], key[stays], rows[stays])
+        yield from _nodes(depth, key[stays], rows[stays])
         rows, unit = rows[~stays], unit[~stays]
 
 
-def _nodes(depth: int, node: I64, key: I64, rows: I64) -> Iterator[tuple[Node, I64]]:
+def _nodes(depth: int, key: I64, rows: I64) -> Iterator[tuple[Node, I64]]:
     order = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])
     for part in np.split(order, starts[1:]):
-        x, y, z = (int(v) for v in node[part[0]])
-        yield (depth, x, y, z), rows[part]
+        cell = int(key[part[0]])
+        yield (depth, cell >> 42, cell >> 21 & MASK, cell & MASK), rows[part]
 
 
 EARTH_CENTRED = 4978
