@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from recon.mapping.free_space import air_above
+from recon.surface.change import level_filled
 from recon.surface.raster import Grid, Raster, grid_over, rasterise_points, round_cell
 from recon.types import F64, U8, Bool
 from service.errors import InputError
@@ -80,6 +81,9 @@ class ExportOptions:
         is_amsl = self.to_datum is None and self.vertical_datum != "ellipsoid"
         return "height_amsl_m" if is_amsl else "height_m"
 
+
+HOLE_CELLS = 2
+"""Voxels and cells of one size leave lines of cells without a point."""
 
 NO_POINTS = "contains no points yet; nothing to export"
 
@@ -250,11 +254,15 @@ class ScanView:
             raise InputError(f"{self.folder}: {error} with --cell-m") from error
 
     def raster(self, cell_m: float | None) -> Raster:
-        """The upper surface on :meth:`grid`, also where it is doubtful."""
+        """The upper surface on :meth:`grid`, also where it is doubtful, and in narrow gaps between
+        level cells."""
         cloud = self.fused.cloud
         return self.shared(
             ("raster", cell_m),
-            lambda: rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m)),
+            lambda: level_filled(
+                rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m)),
+                HOLE_CELLS,
+            ),
         )
 
     def air_above(self, places_m: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:

@@ -31,7 +31,7 @@ from recon.types import F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
-from service.offline.exports.view import USUAL, ExportOptions, ScanView, in_parts
+from service.offline.exports.view import HOLE_CELLS, USUAL, ExportOptions, ScanView, in_parts
 from service.offline.geopackage import Layer, write_layers
 from service.offline.site.alignment import AlignedSite, align_site, write_files
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
@@ -48,9 +48,6 @@ from service.stream.store import ScanStore
 
 CHANGE_TIF, CHANGE_GPKG = "change.tif", "change.gpkg"
 CHANGE_JSON, CHANGE_PAGE = "change.json", "change.html"
-HOLE_CELLS = 2
-"""Voxels and cells of one size leave lines of cells without a point."""
-
 MARGIN_M = 40.0
 """Around a tile: bending is a mean over 10 m (1 sigma); a smaller object is measured whole."""
 
