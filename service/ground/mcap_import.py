@@ -28,7 +28,7 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, U8, DepthMap, Keyframe, Pose
-from service.errors import InputError
+from service.errors import InputError, refusing
 from service.ground.storage import bounded
 from service.offline.exports.recording import POINT
 from service.packages import needing
@@ -73,10 +73,8 @@ def header_in(path: Path) -> ScanHeader:
                 notes=(NOTE,),
                 run_id=run_id,
             )
-            fault = read_header(header.to_json())
-            if isinstance(fault, str):
-                raise InputError(f"{path}: its scan is invalid ({fault})")
-            return header
+            with refusing(f"{path}: its scan is invalid"):
+                return read_header(header.to_json())
     raise InputError(f"{path} is not a recording of a skyrelief scan")
 
 

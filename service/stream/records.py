@@ -61,19 +61,22 @@ class ScanHeader:
 
 def header_from_json(data: bytes) -> ScanHeader | None:
     """The header in ``data``, or None when it is invalid or too large."""
-    found = read_header(data)
-    return None if isinstance(found, str) else found
+    try:
+        return read_header(data)
+    except ValueError:
+        return None
 
 
-def read_header(data: bytes) -> ScanHeader | str:
-    """The header in ``data``, or the error in it."""
+def read_header(data: bytes) -> ScanHeader:
+    """The header in ``data``; ValueError says what is wrong with it."""
     if len(data) > MAX_HEADER_BYTES:
-        return f"it has {len(data)} bytes, at most {MAX_HEADER_BYTES} are allowed"
+        raise ValueError(f"it has {len(data)} bytes, at most {MAX_HEADER_BYTES} are allowed")
     try:
         header = msgspec.json.decode(data.decode("utf-8"), type=ScanHeader)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        return str(error)
-    return validity.fault_of_camera(header.camera) or header
+    except RecursionError as error:
+        raise ValueError(str(error)) from error
+    validity.check_camera(header.camera)
+    return header
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from threading import Lock
 from typing import Any
 
 from recon.types import Keyframe
-from service.errors import InputError
+from service.errors import InputError, refusing
 from service.stream import codec
 from service.stream.database import (
     SCHEMA_VERSION,
@@ -442,8 +442,8 @@ class ScanStore:
         with self._lock:
             if number in self._inventory.of(kind) or zlib.crc32(data) != number:
                 return False
-            header = read_header(data) if kind == "header" else self._header
-            if isinstance(header, str) or header.identity != self._header.identity:
+            header = header_from_json(data) if kind == "header" else self._header
+            if header is None or header.identity != self._header.identity:
                 return False
             if kind == "summary" and summary_from_json(data) is None:
                 return False
@@ -510,10 +510,8 @@ class ScanStore:
             raise InputError(f"{self.path} contains no scan header; it is not a scan database")
         if int(schema) > SCHEMA_VERSION:
             raise InputError(f"{self.path} was written by a newer version; update skyrelief")
-        header = read_header(text.encode())
-        if isinstance(header, str):
-            raise InputError(f"{self.path}: the scan's header is not valid ({header})")
-        return header
+        with refusing(f"{self.path}: the scan's header is not valid"):
+            return read_header(text.encode())
 
     def next_id(self, table: str) -> int:
         """The number of the next row of a table."""

@@ -105,21 +105,20 @@ def summary_from_json(data: bytes) -> dict[str, Any] | None:
     return raw
 
 
-def fault_of_camera(camera: dict[str, Any]) -> str:
-    """The error in a header's camera; empty when valid."""
+def check_camera(camera: dict[str, Any]) -> None:
+    """Raise ValueError for a header's camera that is none."""
     try:
         found = msgspec.convert(camera, _CameraJson)
     except msgspec.ValidationError as error:
-        return f"camera: {error}"
+        raise ValueError(f"camera: {error}") from error
     if found.K is None:
-        return ""
+        return
     fx, _, cx, _, fy, cy, *_ = found.K
     width, height = found.width or 65_535, found.height or 65_535
     if not is_pinhole((fx, fy, cx, cy), (width, height)):
-        return (
+        raise ValueError(
             f"camera: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} fit no image of {width}x{height}"
         )
-    return ""
 
 
 def is_pinhole(optics_px: tuple[float, float, float, float], size_px: tuple[int, int]) -> bool:
