@@ -265,3 +265,19 @@ def test_the_datum_of_a_logs_altitudes_is_the_scans(tmp_path: Path) -> None:
     header = scan.store.header
     scan.store.close()
     assert (header.vertical_datum, header.origin_alt_amsl_m) == ("ellipsoid", -23.0)
+
+
+@pytest.mark.parametrize("is_pressure", [False, True])
+def test_a_scan_says_which_altitudes_are_those_of_air_pressure(
+    tmp_path: Path, is_pressure: bool
+) -> None:
+    history = VehicleHistory()
+    history.is_pressure_altitude = is_pressure
+    for k in range(3):
+        history.add(PositionSample(None, 53.36, 6.46, -125.0, 5.0, None), k * 100_000_000)
+    scan = real_scan(tmp_path / "scan", history=history)
+    scan.feed(CameraFrame(np.zeros((90, 160, 3), np.uint8), 0, 0, None, "frame 0"))
+    summary = scan.close()
+    scan.store.close()
+    assert "altitude" in summary["assumed"]
+    assert ("pressure" in summary["assumed"]) == is_pressure
