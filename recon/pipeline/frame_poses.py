@@ -23,7 +23,7 @@ def pose_at(
     keyframe carries it."""
     T = se3.compose(T_odom_camera[:3, :3], place_m)
     covariance = se3.about(-place_m, np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
-    return Pose(T, covariance, sources)
+    return Pose(T, covariance, sources, is_aligned=False)
 
 
 class FramePoses:
@@ -37,15 +37,13 @@ class FramePoses:
         self._settled = 0  # the first so many no longer change
         # By segment, of its last frame with a fix: place in the odometry, fix, sigma, sources.
         self._fallbacks: dict[int, tuple[F64, F64, F64, tuple[str, ...]]] = {}
-        self._seen: tuple[PosePrior, Pose, int] | None = None  # the last frame placed by vision
+        self._seen: tuple[PosePrior, Pose] | None = None  # the last frame placed by vision
         self._newest: Pose | None = None  # of a view; None again once all is done
-        self._aligned = -1  # the newest segment that has a similarity to the world
 
     def add_view(self, view: Frame, pose: Pose) -> None:
         """Let a view that is in the graph, at a pose, carry frames from now on."""
         self._views.append(view)
         self._newest = pose
-        self._aligned = view.segment if pose.is_aligned else self._aligned
 
     def settle(self) -> None:
         """Release the keyframes that no longer change."""
@@ -64,7 +62,7 @@ class FramePoses:
         if not frame.is_placed:
             return self._by_telemetry(frame.prior) if frame.state is Tracking.LOST else None
         pose = self.pose(frame, self._fallback(frame))
-        self._seen = frame.prior, pose, frame.segment
+        self._seen = frame.prior, pose
         return pose
 
     def _fallback(self, frame: Frame) -> Pose:
@@ -85,24 +83,20 @@ class FramePoses:
     def _has_fix(self, segment: int) -> bool:
         return segment in self._fallbacks and "gnss" in self._fallbacks[segment][3]
 
-    def _is_aligned(self, segment: int) -> bool:
-        """True when the segment has a similarity to the world; in flight, of the newest one."""
-        if self._newest is not None:
-            return segment == self._aligned
-        return self._map.graph.segments[segment].similarity is not None
-
     def pose(self, frame: Frame, fallback: Pose) -> Pose:
         """A frame in the world, carried by the view at or before it where it can.
 
         A segment too short to be aligned has no scale and no heading: its frames stay at their
         fixes.
         """
-        T_odom_camera, view = frame.T_odom_camera, self._view_of(frame)
-        if view is None or (self._has_fix(frame.segment) and not self._is_aligned(frame.segment)):
+        view = self._view_of(frame)
+        if view is None:
             return fallback
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self._map.trajectory.pose(view.seq)
-        pose = carried(known, se3.inverse(view.T_odom_camera) @ T_odom_camera)
+        if self._has_fix(frame.segment) and not known.is_aligned:
+            return fallback
+        pose = carried(known, se3.inverse(view.T_odom_camera) @ frame.T_odom_camera)
         after = self._map.graph.refuted.get(view.seq) if self._newest is None else None
         return pose if after is None else self._doubted(pose, view.seq, after)
 
@@ -132,8 +126,8 @@ class FramePoses:
             return None
         T = se3.compose(R, position)
         if self._seen is not None:
-            before, seen, segment = self._seen
-            if segment == self._aligned:
+            before, seen = self._seen
+            if seen.is_aligned:
                 T = dead_reckoned(before, prior, seen.T_world_camera, None, 0.0)
         tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
         covariance = se3.about(-T[:3, 3], np.diag(np.square([tilt, tilt, yaw, *sigma])))
