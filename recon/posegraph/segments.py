@@ -26,7 +26,7 @@ MIN_KEYFRAMES = 3
 """Keyframes of a segment before telemetry places it: two leave the turn about their line open."""
 
 SETTLED = 100
-"""Keyframes after which a segment's similarity is taken over only when it has changed notably."""
+"""Keyframes from which on a segment's similarity changes little."""
 
 HEADING_KNOWN_RAD, HEIGHT_KNOWN_M = 1.0, 20.0
 """Sigmas of a heading and of a fix's height below which they place a segment."""
@@ -283,9 +283,6 @@ class Segments:
             found = replace(
                 before, mount_rad=found.mount_rad, drift_m=found.drift_m, span_s=found.span_s
             )
-        is_settled = segment.keyframes >= SETTLED and not fresh.differ(segment.constants)
-        if before is not None and is_settled and not _differ(before, found, nodes):
-            return False  # the graph itself follows such small changes
         segment.similarity, segment.constants = found, fresh
         segment.offsets = with_offsets(fresh, readings, found)
         return True
@@ -339,14 +336,6 @@ def _bend_rad(nodes: list[Node]) -> float:
     A random walk of variance v from end to end has v / 6 about its mean.
     """
     return float(np.sqrt(sum(np.trace(n.covariance[:3, :3]) for n in nodes[1:]) / 18.0))
-
-
-def _differ(before: Alignment, found: Alignment, nodes: list[Node]) -> bool:
-    """True when two frames place a segment apart by more than half their sigma."""
-    ends = (nodes[0], nodes[len(nodes) // 2], nodes[-1])
-    shift = [before.pose(n.T_odom_camera) - found.pose(n.T_odom_camera) for n in ends]
-    sigma = float(np.sqrt(np.trace(found.covariance[3:6, 3:6])))
-    return max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma
 
 
 def _kept_in_place(found: Alignment, first: Node, T: F64) -> Alignment:

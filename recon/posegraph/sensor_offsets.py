@@ -42,10 +42,6 @@ ROUNDS = 6
 """Gauss-Newton steps, each with new robust weights."""
 
 
-NOTABLE_M, NOTABLE_RAD = 0.1, 0.003
-"""Changes of the constants of a whole flight that the map must follow."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Constants:
     """Constant errors of sensors: of a whole flight, whatever becomes of the track, and of one
@@ -94,12 +90,6 @@ class Constants:
             is_relief = self.is_exact and lean > 0.0
             agl = None if is_relief else agl * float(np.exp(self.log_height))
         return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
-
-    def differ(self, other: Constants) -> bool:
-        """True when the other's would notably move the map."""
-        turn, before = (one.turn * one.is_turn_sure for one in (self, other))
-        is_turned = float(np.abs(turn - before).max()) > NOTABLE_RAD
-        return is_turned or abs(self.up_m - other.up_m) > NOTABLE_M
 
 
 Turns = tuple[F64, F64, F64]
