@@ -27,6 +27,7 @@ from recon.posegraph.loop_closure import (
     on_surface,
     warps,
 )
+from recon.similarity import lever
 from recon.tracking import matching
 from recon.types import F32, F64, I64, Bool, DepthMap, Keyframe
 
@@ -118,10 +119,8 @@ def _rigid(here: F64, there: F64, sigma: F64, guess: F64) -> tuple[F64, Bool]:
 def _covariance(T: F64, here: F64, there: F64, sigma: F64, inside: Bool) -> F64:
     """(6, 6) of a left perturbation in a's frame, by the scatter that was left."""
     moved = se3.transform(T, there[inside])
-    H = np.zeros((6, 6))
-    for p, s in zip(moved, sigma[inside], strict=True):
-        J = np.hstack([-se3.hat(p), np.eye(3)]) / s
-        H += J.T @ J
+    J = lever(moved)[:, :, :6] / sigma[inside, None, None]
+    H = np.einsum("nki,nkj->ij", J, J)
     off = (here[inside] - moved) / sigma[inside, None]
     variance = max(float(np.sum(off**2)) / max(3 * len(moved) - 6, 1), 0.3)
     least = MIN_SHARE * float(np.median(sigma))
