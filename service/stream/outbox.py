@@ -389,7 +389,8 @@ class Outbox:
             self._clear_live()
         part_bytes = self.bucket.part_bytes
         for number in range(6):
-            message = self._peek(number, part_bytes, now)
+            lane = self._live.get(number) or self._asked.get(number)
+            message = self._peek_head(now) if lane is None else lane.peek(part_bytes)
             if message is None:
                 continue
             size = wire_bytes(len(message.payload))
@@ -398,9 +399,12 @@ class Outbox:
                 return wait
             size *= sessions if message.token is None else 1
             self.bucket.take(size, now)
-            if number != STATUS and message.scan_id in self._feeds:
-                self._feeds[message.scan_id].count(message)
-            self._pop(number)
+            if lane is None:
+                self._head = None
+            else:
+                lane.pop()
+                if message.scan_id in self._feeds:
+                    self._feeds[message.scan_id].count(message)
             return replace(message, lane=number)
         due = min((feed.head_due for feed in self._feeds.values()), default=now + 1.0)
         return min(1.0, max(0.001, due - now))
@@ -408,17 +412,6 @@ class Outbox:
     def _clear_live(self) -> None:
         for lane in self._live.values():
             lane.clear()
-
-    def _peek(self, lane: int, part_bytes: int, now: float) -> Outgoing | None:
-        if lane == STATUS:
-            return self._peek_head(now)
-        return (self._live.get(lane) or self._asked[lane]).peek(part_bytes)
-
-    def _pop(self, lane: int) -> None:
-        if lane == STATUS:
-            self._head = None
-        else:
-            (self._live.get(lane) or self._asked[lane]).pop()
 
     def _peek_head(self, now: float) -> Outgoing | None:
         if self._head is None:
