@@ -113,6 +113,17 @@ def test_a_lost_frame_is_placed_by_telemetry_that_knows_its_heading() -> None:
     assert lost(replace(known, position_m=None, sigma_position_m=None)) is None
 
 
+def test_a_lost_frame_is_not_reckoned_on_from_a_pose_that_had_no_scale() -> None:
+    """Its segment is aligned by the time it is lost, and the last frame's pose is not."""
+    frames, place_m = FramePoses(empty(), lambda frame: False), np.array([3.0, -28.0, 50.0])
+    known = PosePrior(np.eye(3), 0.02, 0.1, place_m, np.array([2.0, 2.0, 4.0]))
+    placed(frames, replace(known, position_m=None, sigma_position_m=None), frame_at(1, 28.0))
+    frames.add_view(frame_at(0, 0.0), Pose(np.eye(4), np.eye(6)))
+    pose = frames.place(Frame(NO_IMAGE, 0, 2, known, segment=3, state=Tracking.LOST))
+    assert pose is not None
+    np.testing.assert_allclose(pose.T_world_camera[:3, 3], place_m)
+
+
 def test_a_frame_that_is_not_tracked_has_no_place_in_the_odometry() -> None:
     with pytest.raises(AssertionError, match="not tracked"):
         _ = Frame(NO_IMAGE, 0, 1).T_odom_camera
