@@ -100,7 +100,7 @@ $(CORE): pyproject.toml constraints.txt hatch_build.py $(PAGE)
 	  s=0; while kill -0 $$! 2>/dev/null; do sleep 1; s=$$((s + 1)); \
 	  n=$$(ls -d $(VENV)/lib/python*/site-packages/*.dist-info 2>/dev/null | wc -l); \
 	  if test -t 1; then printf '\r[%-40.40s] %s packages, %s s' "$$(printf '%*s' $$n '' | tr ' ' '=')" $$n $$s; \
-	  elif test $$((s % 3)) = 0; then echo "  $$n packages, $$s s"; fi; \
+	  elif test $$((s % 2)) = 0; then echo "  $$n packages, $$s s"; fi; \
 	  done; test ! -t 1 || echo; wait $$!
 	@touch $(CORE)
 
