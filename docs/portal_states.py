@@ -25,6 +25,7 @@ SIZES = {"desktop": (1440, 900), "phone": (390, 844)}
 HIGH_PX, GAP_PX, LABEL_PX = 300, 8, 18
 """A state on the sheet."""
 WAIT_S, STILL_S = 120.0, 60.0
+SHOT_S = 300.0  # splats are drawn slowly in software
 PRESS = "[...document.querySelectorAll('button')].find(b => b.textContent === '{}').click()"
 COLOUR = (
     "(s => {{ s.value = '{}'; s.dispatchEvent(new Event('change', {{ bubbles: true }})) }})"
@@ -112,7 +113,7 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
 
     def shot(name: str) -> None:
         browser.page.wait_for_timeout(1500)  # controls fade in, images load
-        browser.page.screenshot(path=out / f"{name}.png")
+        browser.page.screenshot(path=out / f"{name}.png", timeout=1e3 * SHOT_S)
 
     where = f"{scan.parent.name}/{scan.name}"
     browser.open(f"{base}/#/")

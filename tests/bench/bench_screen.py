@@ -1,10 +1,10 @@
 """The portal's screen at frames that took no part in the scan.
 
-A portal serves the scan to a headless Chromium, which looks from each frame's pose as people do:
-at the layer that the scan opens with, which of a finished scan with ``mesh.glb`` is the mesh, and
-at the depth images over the filled ground. What stands there is turned to the frame's own camera
-and scored as ``skyrelief score --views`` scores the products. The page brightens all colours by one
-factor; it is found at a keyframe, and taken back.
+A portal serves the scan to a headless Chromium, which looks from each frame's pose as people do, at
+the layer that the scan opens with: of a finished scan with ``mesh.glb`` the mesh, else the depth
+images over the filled ground. What stands there is turned to the frame's own camera and scored as
+``skyrelief score --views`` scores the products. The page brightens all colours by one factor, which
+it states and which is taken back.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from bench_options import DataOptions
-from person import Browser, Page, chromium
+from person import Browser, chromium
 from playwright.sync_api import sync_playwright
 
-from recon.types import F64, U8, Bool, Camera, Keyframe
+from recon.types import F64, U8, Bool, Camera
 from service.bench import BenchResult
 from service.errors import InputError, OutsideError
 from service.ground.http import PAGE
@@ -41,7 +41,6 @@ AWAY_M = 40.0  # from the eye to the place looked at
 ASIDE_M = 0.05  # which never lies straight below: there a view without roll has no heading
 DARKER_EV = -2  # the darkest that the page has: hardly a value is clipped then
 SAME = 2  # a pixel that differs by more under another sky shows the sky
-DARK, BRIGHT = 8, 250  # colours between these give the brightness
 IMAGE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
 SETTING = """(() => {
   const label = [...document.querySelectorAll('.settings label')]
@@ -59,7 +58,6 @@ GO_TO = """new Promise(done => {
   addEventListener('hashchange', () => setTimeout(done, 0), { once: true });
   location.hash = '%s';
 })"""
-PRESSED = "[...document.querySelectorAll('.tools button.on')].map(b => b.textContent).join()"
 ALL_SHOWN = """[...document.querySelectorAll('.figures div')]
   .some(row => row.textContent === 'Images%d')"""
 SIDE = """(() => {
@@ -82,11 +80,11 @@ def run(options: DataOptions) -> list[BenchResult]:
     def goes_on(done: int) -> bool:
         return done < options.frames and time.monotonic() < until
 
-    with ScanView(options.scan) as scan, _screens(scan) as screens:
+    with ScanView(options.scan) as scan, _screen(scan) as screen:
         used = {k.time_ns for k in main_keyframes(scan.store)}
         every = max(1, len(left_out(scan.poses, used, 1)) // options.frames)
         views = None if kept is None else kept / "views"
-        others = {screen.layer: screen.view for screen in screens}
+        others = {f"screen, {screen.layer}": screen.view}
         scores = frame_scores(scan, options.flight, views, others, every, goes_on)
     if kept is not None:
         (kept / "frames.json").write_text(json.dumps(scores, indent=1))
@@ -111,13 +109,11 @@ def run(options: DataOptions) -> list[BenchResult]:
 
 
 class Screen:
-    """What a layer of the page shows of a scan from a camera's place."""
+    """What the page shows of a scan from a camera's place."""
 
-    def __init__(
-        self, browser: Page, address: str, scan: ScanView, is_meshed: bool, gain: float = 1.0
-    ) -> None:
-        """``gain`` is the factor of the page's colours, in linear light."""
-        self.browser, self.address, self.gain = browser, address, gain
+    def __init__(self, browser: Browser, address: str, scan: ScanView, layer: str) -> None:
+        """``layer`` is what the scan opens with."""
+        self.browser, self.address, self.layer = browser, address, layer
         self.camera = camera_of(scan.store.header)
         w, h = self.camera.size_px
         away = np.array([[0, 0], [w, 0], [0, h], [w, h]]) - self.camera.K[:2, 2]
@@ -127,16 +123,11 @@ class Screen:
         browser.open(address)
         keyframes = sum(1 for _ in scan.store.keyframes())
         self._wait(ALL_SHOWN % keyframes, f"all {keyframes} keyframes")
-        if is_meshed:
+        if layer == "mesh":
             self._wait("document.body.dataset.mesh === 'shown'", "the mesh")
         self._fit()
         self._set("Field of view", f"field.value = {self.degrees};")
         self._set("Exposure", f"field.value = {DARKER_EV};")
-
-    @property
-    def layer(self) -> str:
-        """What the page calls it."""
-        return "screen, mesh" if "Mesh" in self.browser.run(PRESSED) else "screen, surface"
 
     def view(self, T: F64) -> tuple[U8, Bool]:
         """(H, W, 3) BGR and (H, W) covered pixels from a T_world_camera (4, 4)."""
@@ -156,7 +147,8 @@ class Screen:
             for image in (dark, light)
         )
         change = np.abs(dark.astype(int) - light).max(axis=2)
-        return as_recorded(dark, self.gain), change <= SAME
+        gain = float(self.browser.run("Number(document.body.dataset.gain)"))
+        return as_recorded(dark, gain), change <= SAME
 
     def _wait(self, script: str, what: str) -> None:
         try:
@@ -188,21 +180,6 @@ class Screen:
         data = np.frombuffer(base64.b64decode(self.browser.run(IMAGE)), np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
-    def find_gain(self, keyframe: Keyframe) -> None:
-        """That of the middle pixel of a keyframe, without the page's shading."""
-        self._set("Shading", "field.value = 0;")
-        image, covered = self.view(keyframe.depth.T_world_camera)
-        self._set("Shading", "field.value = 1;")
-        size = (keyframe.bgr.shape[1], keyframe.bgr.shape[0])
-        shown = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        there = cv2.resize(covered.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        shared = there & keyframe.fresh
-        for one in (shown, keyframe.bgr):
-            shared &= (one.min(axis=2) >= DARK) & (one.max(axis=2) <= BRIGHT)
-        if not shared.any():
-            raise InputError("bench screen: the portal shows nothing of the middle keyframe")
-        self.gain = float(np.median(_linear(shown[shared]) / _linear(keyframe.bgr[shared])))
-
 
 def to_camera(camera: Camera, T: F64, eye: F64, aim: F64, degrees: float, side_px: int) -> F64:
     """(3, 3) from pixels of a square scene, which looks from ``eye`` to ``aim`` without roll, to
@@ -230,10 +207,8 @@ def _linear(srgb: npt.ArrayLike) -> F64:
 
 
 @contextmanager
-def _screens(scan: ScanView) -> Iterator[list[Screen]]:
-    """The scan in a browser, before a portal that has nothing else: its depth images, and the mesh
-    where it opens as that. Both have the factor that is found at the depth images."""
-    keyframes = list(main_keyframes(scan.store))
+def _screen(scan: ScanView) -> Iterator[Screen]:
+    """The scan in a browser, before a portal that has nothing else."""
     with tempfile.TemporaryDirectory() as root:
         folder = Path(root) / "scans" / "bench" / "screen"
         shutil.copytree(scan.folder, folder, ignore=shutil.ignore_patterns("splat.ply", "*.mcap"))
@@ -244,14 +219,7 @@ def _screens(scan: ScanView) -> Iterator[list[Screen]]:
                 browser = Browser(driver)
                 address = f"{portal.url.split('/?')[0]}/#/view/bench/screen"
                 is_meshed = portal.state.library.entry("bench", "screen")["meshed"]
-                surface = Screen(browser, address, scan, is_meshed)
-                if is_meshed:
-                    browser.click("Surface")
-                surface.find_gain(keyframes[len(keyframes) // 2])
-                screens = [surface]
-                if is_meshed:
-                    screens.append(Screen(browser.other(), address, scan, is_meshed, surface.gain))
-                yield screens
+                yield Screen(browser, address, scan, "mesh" if is_meshed else "surface")
                 browser.close()
         finally:
             portal.close()

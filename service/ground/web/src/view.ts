@@ -96,6 +96,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     cloud.screen(stage.camera, stage.renderer.domElement.height / 2);
     const { gain, shading, behind } = cloud;
     Object.assign(stage.painter.dome, { gain, shading, behind });
+    document.body.dataset["gain"] = String(gain);
   });
   stage.drawGradually(cloud);
   stage.add(cameras.group);
