@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ from house_flight import HouseFlight
 from loopback import until
 from portal_client import TOKEN, flown_store
 
+from service.ground.library import Library
 from service.ground.portal import Portal, PortalConfig
+from service.ground.scan_facts import is_current
+from service.ground.upload import unpack
 from service.scans.folder import write_deliverables
 from service.stream.store import ScanStore
 
@@ -76,6 +80,24 @@ def test_nothing_is_made_where_nobody_wants_it_or_it_does_not_fit(
     monkeypatch.setattr("shutil.disk_usage", lambda _: FullDisk())
     portal.ended(folder)
     assert not portal.jobs.of(folder)
+
+
+def test_a_mesh_stays_that_of_its_scan_when_it_is_imported(folder: Path, tmp_path: Path) -> None:
+    for name, age_s in (("scan.json", 60), ("mesh.glb", 20)):
+        (folder / name).touch()
+        then = time.time() - age_s
+        os.utime(folder / name, (then, then))
+    copied = Library(tmp_path / "copied")
+    assert copied.entry(*copied.take(folder))["meshed"]
+    with zipfile.ZipFile(tmp_path / "scan.zip", "w") as archive:
+        for name in ("mesh.glb", "scan.json", "scan.db"):
+            archive.write(folder / name, name)
+    (tmp_path / "unpacked").mkdir()
+    unpack(tmp_path / "scan.zip", tmp_path / "unpacked")
+    assert is_current(tmp_path / "unpacked/mesh.glb")
+    os.utime(folder / "mesh.glb", (0, 0))
+    older = Library(tmp_path / "older")
+    assert not older.entry(*older.take(folder))["meshed"]
 
 
 class FullDisk:

@@ -4,12 +4,12 @@ import * as THREE from "three";
 import * as api from "./api";
 import type { Cameras } from "./cameras";
 import { copy, el, notify } from "./dom";
+import { wasClick } from "./measure";
 import type { Cloud } from "./points";
 import type { Stage } from "./stage";
 import * as units from "./units";
 
 const IMAGE_EVERY_MS = 1500;
-const CLICK_PX = 5; // a pointer that moved farther turned the view
 const NEAR_PX = 14;
 const DAY_S = 86400;
 const SPEEDS = [1, 2, 5, 10, 20];
@@ -178,14 +178,9 @@ export class Images {
   private chosen: number | null = null;
   private shown = -1;
   private version = 0;
-  private down: { x: number; y: number } | null = null;
 
   constructor(private readonly site: Site, free: () => boolean) {
-    const canvas = site.stage.renderer.domElement;
-    canvas.addEventListener("pointerdown", (e) => (this.down = { x: e.clientX, y: e.clientY }));
-    canvas.addEventListener("click", (e) => {
-      if (free() && this.down && Math.hypot(e.clientX - this.down.x, e.clientY - this.down.y) <= CLICK_PX) this.click(e);
-    });
+    site.stage.renderer.domElement.addEventListener("click", (e) => free() && wasClick(e) && this.click(e));
   }
 
   /** A keyframe came, or a finer layer of one: its image is fetched again. */
