@@ -7,7 +7,7 @@ do not fit wait in the store until a ground station requests them.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
@@ -222,15 +222,8 @@ class _Feed:
     head_due: float
     head_sent: float = -1e9
     held: dict[str, Numbers] = field(default_factory=dict)
-    live_bytes: int = 0  # of this scan's items, sent to all stations
-    answered_bytes: dict[str, int] = field(default_factory=dict)  # and to each on request
-
-    def count(self, message: Outgoing) -> None:
-        size, answered = len(message.payload), self.answered_bytes
-        if message.peer:
-            answered[message.peer] = answered.get(message.peer, 0) + size
-        else:
-            self.live_bytes += size
+    sent_bytes: Counter[str] = field(default_factory=Counter)
+    """Of its items: to each station on request, and to "" unrequested."""
 
 
 class Outbox:
@@ -293,8 +286,7 @@ class Outbox:
         if is_first:
             self._catch_up(feed, report.numbers)
         estimate = self._estimates.setdefault((scan_id, peer), RateEstimate(self._configured))
-        sent_bytes = feed.live_bytes + feed.answered_bytes.get(peer, 0)
-        estimate.report(sent_bytes, report.received_bytes, now)
+        estimate.report(feed.sent_bytes[""] + feed.sent_bytes[peer], report.received_bytes, now)
         self._adapt(now)
         return True
 
@@ -315,7 +307,7 @@ class Outbox:
         self._head = None
         for feed in self._feeds.values():
             feed.head_due = now
-            feed.answered_bytes.clear()
+            feed.sent_bytes.clear()
 
     def forget_requests(self) -> None:
         self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
@@ -372,7 +364,7 @@ class Outbox:
             for key in [key for key in self._estimates if key[1] == silent]:
                 del self._estimates[key]
             for feed in self._feeds.values():
-                feed.answered_bytes.pop(silent, None)
+                feed.sent_bytes.pop(silent, None)
         if not self.listened(now):
             self.publish_heads(now)
         self._heard[peer] = now
@@ -404,7 +396,7 @@ class Outbox:
             else:
                 lane.pop()
                 if message.scan_id in self._feeds:
-                    self._feeds[message.scan_id].count(message)
+                    self._feeds[message.scan_id].sent_bytes[message.peer] += len(message.payload)
             return replace(message, lane=number)
         due = min((feed.head_due for feed in self._feeds.values()), default=now + 1.0)
         return min(1.0, max(0.001, due - now))
