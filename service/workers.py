@@ -12,6 +12,7 @@ import atexit
 import contextlib
 import logging
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -362,9 +363,11 @@ def _last_line(file: IO[bytes]) -> str:
     return (text.strip().splitlines() or [""])[-1][:300]
 
 
-def end_process(process: subprocess.Popen[bytes], patience_s: float = 2.0) -> None:
-    """Ask a process to end, and kill it when it does not."""
-    process.terminate()
+def end_process(
+    process: subprocess.Popen[bytes], patience_s: float = 2.0, asks: int = signal.SIGTERM
+) -> None:
+    """Ask a process to end, by the signal ``asks``, and kill it when it does not."""
+    process.send_signal(asks)
     try:
         process.wait(timeout=patience_s)
     except subprocess.TimeoutExpired:

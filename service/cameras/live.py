@@ -21,6 +21,7 @@ import re
 import select
 import shlex
 import shutil
+import signal
 import subprocess
 import time
 import zlib
@@ -339,7 +340,10 @@ def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
     place = re.fullmatch(r"//([^/\s:?@]*|\[[0-9a-fA-F:]+\]):(\d{1,5})(\?\S*)?", rest)
     if place is None or not 0 < int(place[2]) < 65536:
         raise InputError(f"srt:{rest} is not like srt://:9000")
-    source = ["srtsrc", f"uri=srt:{rest}", *([] if place[1] else ["mode=listener"])]
+    # Without a limit of its wait for data, in ms, the element does not end when it is asked to, and
+    # a sender learns only by its own timeout of 5 s that nobody listens.
+    limit = "poll-timeout=100"
+    source = ["srtsrc", f"uri=srt:{rest}", limit, *([] if place[1] else ["mode=listener"])]
     description = without_credentials(f"srt:{rest}")
     pipeline = [*source, "!", "fdsink", "fd=1"]
     return _launched(pipeline, description, LISTEN_OPTIONS | UNPARSED, listens=not place[1])
@@ -444,7 +448,7 @@ class _Command:
 
     def end(self) -> None:
         """End the command, and read what it still says."""
-        end_process(self._process)
+        end_process(self._process, asks=signal.SIGINT)  # at which a pipeline closes its sockets
         self._output.close()
         self._reader.join(1.0)
 
