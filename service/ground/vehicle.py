@@ -141,6 +141,6 @@ def _home_distance(place: dict[str, Any], home: dict[str, Any]) -> float | None:
     home_lat, home_lon = _number(home, "latitude"), _number(home, "longitude")
     if lat is None or lon is None or home_lat is None or home_lon is None:
         return None
-    ends = (value * 1e-7 for value in (home_lon, home_lat, lon, lat))
-    metres = Geod(ellps="WGS84").inv(*ends)[2]
+    globe = Geod(ellps="WGS84")
+    metres = globe.inv(1e-7 * home_lon, 1e-7 * home_lat, 1e-7 * lon, 1e-7 * lat)[2]
     return round(metres, 1) if math.isfinite(metres) else None

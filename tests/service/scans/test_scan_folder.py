@@ -109,7 +109,7 @@ def test_heights_by_air_pressure_are_as_sure_as_the_weather(
     """At one place, over weeks, DJI's drones without RTK state heights that differ by 150 m."""
     with house.flown(tmp_path) as store:
         store.finish({"scale": {"sigma": 0.05}, "assumed": ["altitude", "pressure"]})
-        summary = write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store)
     assert np.median(laspy.read(tmp_path / CLOUD)["sigma_absolute_m"]) == pytest.approx(70.0, 0.01)
     quality = summary["quality"]
     assert quality["sigma_absolute_median_m"] == pytest.approx(70.0, 0.01)
