@@ -16,6 +16,7 @@ from recon.surface.splats import (
     SINGLE,
     WIDTH,
     Splats,
+    gaussians,
     of_depth,
     rendered,
     splats_of,
@@ -192,6 +193,30 @@ def test_a_view_from_elsewhere_shows_the_surface() -> None:
     inner = np.s_[6:-6, 6:-6]
     assert (opacity[inner] >= COVERED).all()
     error = np.sqrt(np.mean((image[inner] - true[inner]) ** 2))
+    assert 20.0 * np.log10(255.0 / error) > 30.0
+
+
+def test_flat_areas_have_few_gaussians_and_edges_all() -> None:
+    """A view whose right half is of one colour, on a ground with a step; the left half is waves."""
+    depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
+    depth.depth_m[:16, 40:] -= 3.0
+    view = painted(depth)
+    view.bgra[:, 32:, :3] = 90
+    one = keyframe(0, depth)
+    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
+    surface = Mesh(corners, np.array([[0, 1, 2]], np.int32))
+    splats = splats_of([one], [view], surface, detail_levels=4)
+    side = np.rint(splats.sigma_m[:, 1] / WIDTH * 60.0 / -(splats.xyz_m[:, 2] - 20.0)).astype(int)
+    u = 31.5 + 60.0 * splats.xyz_m[:, 0] / (20.0 - splats.xyz_m[:, 2])
+    assert np.unique(side).tolist() == [1, 2, 4, 8]
+    assert (side[u < 24] == 1).mean() > 0.9
+    assert (side[u > 36] > 1).mean() > 0.2
+    assert gaussians(one, view, 4) < 0.75 * gaussians(one, view, 0)
+    assert gaussians(one, view, 0) == SIZE[0] * SIZE[1]
+    image, opacity = rendered(splats, K, SIZE, depth.T_world_camera)
+    inner = np.s_[2:-2, 2:-2]
+    assert (opacity[inner] >= COVERED).all()
+    error = np.sqrt(np.mean((image[inner] - view.bgra[..., 2::-1].astype(np.float64)[inner]) ** 2))
     assert 20.0 * np.log10(255.0 / error) > 30.0
 
 
