@@ -3,6 +3,9 @@
 With the code numba also loads what it needs only to compile another kernel, so that comes later,
 if at all: the kernel's intermediate form (those of a flight's kernels take 16 MiB unpacked), and
 the rules of all operations that it can compile, with LLVM's compiler (30 MiB).
+
+This replaces private functions of numba, and code that calls a symbol which nobody has named ends
+the process: a version of numba comes here only once its own loading has been compared.
 """
 
 from __future__ import annotations
@@ -35,15 +38,11 @@ class _Compact(JITCodeLibrary):  # type: ignore[misc]
         return super()._get_module_for_linking()
 
 
-_load = (
-    FunctionCache._load_overload
-)  # of the file, without ``refresh``, which compiling calls itself
-
-
 def _load_overload(cache: Any, signature: Any, target_context: Any) -> Any:
-    """The kernel's code from its file, None without one."""
+    """The kernel's code from its file, None without one; without the context's ``refresh``, which
+    compiling calls itself."""
     with cache._guard_against_spurious_io_errors():
-        return _load(cache, signature, target_context)
+        return cache._load_overload(signature, target_context)
 
 
 def load_code_alone() -> None:

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
 from functools import cache
 from itertools import pairwise
 from threading import Event
 from typing import Any, TypeVar
 
-from numba import config
+from numba import config, version_info
 
 T = TypeVar("T")
 
@@ -25,9 +24,7 @@ RELEASE_S = 1e-4
 CELLS_PER_THREAD = 1 << 20
 """Cells of a cost volume that are worth a thread: half a millisecond of simple work."""
 
-with suppress(
-    ImportError, AttributeError
-):  # numba's own names, which another version need not have
+if version_info.short in [(0, minor) for minor in range(60, 68)]:  # they load kernels alike
     from recon.compiled import load_code_alone
 
     load_code_alone()  # before the first kernel is loaded
