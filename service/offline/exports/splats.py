@@ -27,7 +27,7 @@ LARGEST_SPLATS = 6_000_000
 
 SHRINK = 0.8
 """What would be more is made of images that are smaller by so much; beyond that, flat areas lose
-detail first: images at half their size lose it at edges too, and 5 dB with it."""
+detail first: images at half their size lose it at edges too, and 3 dB with it."""
 
 DETAILS, COUNTED = (0, 2, 3, 4, 6, 8), 8
 """Levels of colour that are taken for detail, from all to what shows; views it is tried on."""
