@@ -224,9 +224,16 @@ def _settle(view: I32, cost: F32, neighbours: I32, penalty: float, slot: I32) ->
 HUBER_LEVELS = 8.0
 ROUNDS = 10
 MAX_SAMPLES = 300_000
+SCALE = 128.0
+"""Levels; so that gain and offset weigh alike."""
+
+PULL = 0.004
+"""Weight of each view's own colours against those of its pairs: more would leave steps where half
+of a flight is under a cloud, or where it gets dark."""
+
 UNCHANGED_LEVELS = 0.5
-"""Most images have the flight's exposure. One that differs by more pulls no harder towards it: few
-odd ones, as under a cloud, neither stay so nor make all others brighter or darker."""
+"""Most images have the flight's exposure. Those that differ by more count less for it: few odd
+ones, as under a cloud, do not make all others brighter or darker."""
 
 FADE_RINGS = 4
 """Rings of triangles on each side of a seam across which the views fade."""
@@ -238,17 +245,26 @@ def levels(found: TriangleViews, views: int) -> F32:
     """(views, 3, 2) gain and offset per channel (BGR) that make views agree where they overlap.
 
     Least squares over triangles that two views see, ``g_a I_a + o_a = g_b I_b + o_b``, with
-    Huber weights for the pairs, and for the prior gain 1 and offset 0 of each view; a view alone
-    keeps its colours.
+    Huber weights, and a light pull of each view to gain 1 and offset 0. Most views keep their
+    brightness: by Huber weights, too, the mean gain is 1 and the mean offset 0. A view alone keeps
+    its colours.
     """
     a, b, colour_a, colour_b = _pairs(found)
     out = np.zeros((views, 3, 2), np.float32)
     out[..., 0] = 1.0
     if not len(a):
         return out
-    for channel in range(3):
-        solved = _solve(a, b, colour_a[:, channel], colour_b[:, channel], views)
-        out[:, channel] = solved
+    channels = [_Channel(a, b, colour_a[:, k], colour_b[:, k], views) for k in range(3)]
+    trust = np.ones(views)
+    for number in range(ROUNDS):
+        limit = HUBER_LEVELS if number else np.inf  # the first round weighs all alike
+        for one in channels:
+            one.solve(limit, trust)
+        # One weight for all channels: else the mean may be of some views' red and others' blue.
+        change = np.sqrt(np.mean([one.squared_change() for one in channels], axis=0))
+        trust = np.minimum(1.0, UNCHANGED_LEVELS / np.maximum(change, 1e-9))
+    for k, one in enumerate(channels):
+        out[:, k] = np.column_stack([one.x[::2], SCALE * one.x[1::2]])
     return out
 
 
@@ -269,30 +285,37 @@ def _pairs(found: TriangleViews) -> tuple[I32, I32, F64, F64]:
     return a[fair], b[fair], colour_a[fair], colour_b[fair]
 
 
-def _solve(a: I32, b: I32, colour_a: F64, colour_b: F64, views: int) -> F64:
-    """(views, 2) gain and offset of one channel."""
-    n = len(a)
-    scale = 128.0  # so that gain and offset weigh alike
-    both, colours = np.concatenate([a, b]), np.concatenate([colour_a, colour_b])
-    seen, total, squares = (np.bincount(both, colours**k, minlength=views) for k in range(3))
-    # Of each view, (2, 2): what the squared change of its own colours follows from.
-    moments = np.array([[squares, scale * total], [scale * total, scale**2 * seen]])
-    moments += 1e-6 * scale**2 * np.maximum(seen, 1) * np.eye(2)[..., None]
-    start = np.tile([1.0, 0.0], views)
-    x, trust = start.copy(), np.ones(views)
-    for number in range(ROUNDS):
-        limit = HUBER_LEVELS if number else np.inf  # the first round weighs all alike
-        N = np.zeros((2 * views, 2 * views))
-        _add_pairs(a, b, colour_a, colour_b, scale, x, limit, N)
-        pull = sparse.block_diag((trust * moments).transpose(2, 0, 1)).toarray()
-        # The mean gain is 1 and the mean offset 0, or noise would draw all of them to black.
-        mean = np.kron(trust * seen / (trust * seen).sum(), np.eye(2))
-        fixed = 1e3 * n * scale**2 * (mean.T @ mean)
-        x = np.linalg.solve(N + pull + fixed, (pull + fixed) @ start)
-        change = (x - start).reshape(views, 2)
-        squared = np.einsum("vi,ijv,vj->v", change, moments, change) / np.maximum(seen, 1)
-        trust = np.minimum(1.0, UNCHANGED_LEVELS / np.maximum(np.sqrt(squared), 1e-9))
-    return np.column_stack([x[::2], scale * x[1::2]])
+class _Channel:
+    """Gains, and offsets in SCALE levels, of one channel: ``x`` (2 views,), in turn."""
+
+    def __init__(self, a: I32, b: I32, colour_a: F64, colour_b: F64, views: int) -> None:
+        self._pairs = a, b, colour_a, colour_b
+        both, colours = np.concatenate([a, b]), np.concatenate([colour_a, colour_b])
+        seen, total, squares = (np.bincount(both, colours**k, minlength=views) for k in range(3))
+        # Of each view, (2, 2): what the squared change of its own colours follows from.
+        moments = np.array([[squares, SCALE * total], [SCALE * total, SCALE**2 * seen]])
+        moments += 1e-6 * SCALE**2 * np.maximum(seen, 1) * np.eye(2)[..., None]
+        self._seen, self._moments = seen, moments
+        self._pull = PULL * sparse.block_diag(moments.transpose(2, 0, 1)).toarray()
+        self._start = np.tile([1.0, 0.0], views)
+        self.x = self._start
+
+    def solve(self, limit: float, trust: F64) -> None:
+        """Fit ``x`` by Huber's weights at the last one; views count for the mean by their
+        ``trust`` (views,)."""
+        weight = trust * self._seen
+        N = np.zeros((len(self.x), len(self.x)))
+        _add_pairs(*self._pairs, SCALE, self.x, limit, N)
+        # Without a mean gain of 1 and offset of 0, noise would draw all of them to black.
+        mean = np.kron(weight / weight.sum(), np.eye(2))
+        fixed = 1e3 * len(self._pairs[0]) * SCALE**2 * (mean.T @ mean) + self._pull
+        self.x = np.linalg.solve(N + fixed, fixed @ self._start)
+
+    def squared_change(self) -> F64:
+        """(views,) mean squared change of a view's own colours."""
+        change = (self.x - self._start).reshape(-1, 2)
+        squared = np.einsum("vi,ijv,vj->v", change, self._moments, change)
+        return np.asarray(squared / np.maximum(self._seen, 1))
 
 
 @njit(cache=True, nogil=True)

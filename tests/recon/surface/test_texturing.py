@@ -253,6 +253,38 @@ def test_two_bright_images_of_ten_leave_the_others_as_they_are() -> None:
     assert np.abs(shown - 100.0).max() < 2.0
 
 
+@pytest.mark.parametrize("is_sudden", [True, False])
+def test_a_block_that_darkens_on_the_way_has_no_steps(is_sudden: bool) -> None:
+    """Eight lines of ten views, flown to and fro: in the end under a cloud, or at dusk."""
+    rng = np.random.default_rng(5)
+    number = np.arange(80)
+    line, along = number // 10, number % 10
+    along = np.where(line % 2, 9 - along, along)
+    gain = np.where(line < 4, 1.0, 0.7) if is_sudden else np.linspace(1.0, 0.6, 80)
+    place = rng.uniform([-0.3, -0.3], [7.3, 9.3], (20_000, 2))
+    apart = np.hypot(place[:, :1] - line, place[:, 1:] - along)
+    view = np.argsort(apart + rng.uniform(0, 0.6, apart.shape), axis=1)[:, :3]
+    found = rows(view.tolist(), [[3.0, 2.0, 1.0]] * len(view))
+    true = rng.uniform(40.0, 150.0, (len(view), 1, 1))
+    found.bgr[:, :3] = true * gain[view][..., None] + rng.normal(0.0, 3.0, (len(view), 3, 3))
+    fixed = levels(found, 80).astype(np.float64)
+    shown = fixed[..., 0] * gain[:, None] * 100.0 + fixed[..., 1]
+    assert np.abs(shown[view[:, 0]] - shown[view[:, 1]]).max() < 4.0
+    assert shown.min() > 55.0 and shown.max() < 105.0
+
+
+def test_images_of_two_white_balances_become_grey_by_one_of_them_or_between() -> None:
+    rng = np.random.default_rng(6)
+    gain = np.where(np.arange(10)[:, None] % 2, [0.7, 1.0, 1.0], [1.0, 1.0, 0.7])
+    view = np.array([rng.permutation(10)[:3] for _ in range(6000)])
+    found = rows(view.tolist(), [[3.0, 2.0, 1.0]] * len(view))
+    true = rng.uniform(40.0, 150.0, (len(view), 1, 1))
+    found.bgr[:, :3] = true * gain[view] + rng.normal(0.0, 3.0, (len(view), 3, 3))
+    fixed = levels(found, 10).astype(np.float64)
+    blue, _, red = (fixed[..., 0] * gain * 100.0 + fixed[..., 1]).mean(axis=0)
+    assert blue + red == pytest.approx(167.0, abs=4.0)  # 165 of the mean, 170 of either half
+
+
 def test_a_car_in_one_of_five_views_is_left_out() -> None:
     found = rows([[0, 1, 2, 3, 4]], [[5.0, 4.0, 3.0, 2.0, 1.0]])
     found.bgr[0, :5] = 100.0
