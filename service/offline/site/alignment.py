@@ -173,7 +173,7 @@ def _known(out: Path) -> KnownSite:
     if (out / SITE).is_file():
         return read_json(out / SITE, KnownSite, MAX_SITE_BYTES, "a site; remove the folder")
     if not out.exists() or (out.is_dir() and all(path.name[0] == "." for path in out.iterdir())):
-        return KnownSite()  # empty, or left by a process that was killed
+        return KnownSite([])  # empty, or left by a process that was killed
     raise InputError(f"{out} exists and is not a site; choose another folder")
 
 

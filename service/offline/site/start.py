@@ -50,7 +50,7 @@ class KnownScan(msgspec.Struct):
 class KnownSite(msgspec.Struct):
     """What an alignment takes from the document of the one before it."""
 
-    scans: list[KnownScan] = []
+    scans: list[KnownScan]  # without them the file is another program's
     revision: int = 0
     history: list[dict[str, Any]] = []
 

@@ -263,6 +263,11 @@ def test_bad_scans_are_named(tmp_path: Path) -> None:
         align_site([tmp_path], tmp_path / "fourth")
     with pytest.raises(InputError, match="is not a site"):
         align_site([one], one)
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "site.json").write_text('{"title": "my web site"}')
+    with pytest.raises(InputError, match=r"site\.json cannot be read"):
+        align_site([one], tmp_path / "foreign")
+    assert [path.name for path in (tmp_path / "foreign").iterdir()] == ["site.json"]
     with pytest.raises(InputError, match="one scan"):
         compare(one, one, tmp_path / "fifth")
 
