@@ -123,6 +123,8 @@ def tile_boxes(prints: Sequence[Extent], max_points: int) -> list[Box]:
     side, down to MIN_SHARE of the site's. Empty boxes are left out. Points are taken as spread
     evenly over each keyframe's rectangle.
     """
+    if sum(p.points for p in prints) <= max_points:
+        return [EVERYWHERE]
     bounds = union(p.box for p in prints)
     least_m = MIN_SHARE * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
     rest, out = [[*EVERYWHERE]], list[Box]()

@@ -34,12 +34,14 @@ def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
         scan.progress("maps of the cloud; export ortho and dsm first" if made is None else "report")
         cloud, raster, coverage = scan.fused.cloud, surface(scan.fused), coverage_of(store)
         shown = middle_stages(folder, store)
-        maps = None if raster is None else maps_of(summary, scan.poses, raster)
+        maps = None
         if made is not None:  # an orthophoto has its own light
             track_m = np.array([p.T_world_camera[:3, 3] for p in scan.poses]).reshape(-1, 3)
             frame = scan.flown_frame
             track_m = track_m if frame is None else frame.to_utm(track_m)
             maps = draw_maps(made, track_m, LARGEST_CELLS, 0.0, is_shaded=False)
+        elif raster is not None:
+            maps = maps_of(summary, scan.poses, raster)
         page = report_html(summary, scan.poses, cloud, raster, coverage, shown, maps)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(

@@ -148,7 +148,7 @@ def reach_m(one: Keyframe) -> float:
 def weighted(loops: Sequence[Loop]) -> list[Loop]:
     """The loops, less sure where several rest on the same filled surfaces: they err alike."""
     ends = np.array([(one.a, one.b) for one in loops]).reshape(-1, 2)
-    near = (np.abs(ends[:, None] - ends).max(axis=2) <= NEIGHBOURS).sum(axis=1)
+    near = [int((np.abs(ends - end).max(axis=1) <= NEIGHBOURS).sum()) for end in ends]
     return [replace(o, covariance=n * o.covariance) for o, n in zip(loops, near, strict=True)]
 
 

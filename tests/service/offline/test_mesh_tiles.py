@@ -75,6 +75,7 @@ def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
         Extent(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20)) for n in range(20)
     ]
     assert tile_boxes(prints, 100_000) == [EVERYWHERE]
+    assert tile_boxes([Extent(0, 3, 0.2, (1.0, 2.0, 1.0, 5.0))], 100_000) == [EVERYWHERE]
     boxes = tile_boxes(prints, 3000)
     assert len(boxes) > 6
     rng = np.random.default_rng(0)
