@@ -310,8 +310,9 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     """``raster`` with its holes up to ``largest_cells`` wide filled by the mean around them.
 
     Only holes are closed: the outline of the surveyed area does not grow into the unknown. Filled
-    cells carry the sigma of their surroundings, doubled. For display;
-    :mod:`recon.surface.hole_filling` is for measurement.
+    cells carry the sigma of their surroundings, doubled. For display, as a mean next to steps is
+    wrong; :func:`recon.surface.change.level_filled`, for narrow holes, and
+    :mod:`recon.surface.hole_filling` are for measurement.
     """
     known = raster.known
     if largest_cells < 1 or known.all() or not known.any():

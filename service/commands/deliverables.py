@@ -43,7 +43,8 @@ def export(
     cell_m: Annotated[float | None, typer.Option(help="cell size of dsm, ortho, contours")] = None,
     contour_m: Annotated[float, typer.Option(help="contour interval")] = 1.0,
     strict: Annotated[
-        bool, typer.Option("--strict", help="leave the holes of the surface model unknown")
+        bool,
+        typer.Option("--strict", help="surface model: leave unknown what band 3 does not call 0"),
     ] = False,
     video: Recording = None,
     stored: StoredImages = False,

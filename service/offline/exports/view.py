@@ -45,7 +45,7 @@ class ExportOptions:
     voxel_m: float | None = None
     cell_m: float | None = None
     contour_m: float = 1.0
-    strict: bool = False  # unknown cells of the surface model are not filled
+    strict: bool = False  # cells that the surface model does not count as measured stay unknown
     video: Path | None = None  # None: the scan's recording, when it is still there
     stored: bool = False  # never look for the recording
     video_epoch_ns: int | None = None
@@ -83,7 +83,8 @@ class ExportOptions:
 
 
 HOLE_CELLS = 2
-"""Voxels and cells of one size leave lines of cells without a point."""
+"""Voxels and cells of one size leave lines of cells without a point; gaps so wide between level
+cells count as measured, with twice the sigma around them."""
 
 NO_POINTS = "contains no points yet; nothing to export"
 

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
+from scipy import ndimage
 
-from recon.surface.raster import Raster
+from recon.surface.raster import Raster, rasterise_points
 from recon.types import F64, U8, Array, Bool
 from service.offline.exports.surface import UNCERTAIN, cell_places, complete_model
 from service.offline.exports.view import ScanView
@@ -74,3 +76,19 @@ def test_doubtful_edges_of_a_roof_that_keyframes_confirm_are_marked(
     edge = on_roof(places, 0.5) & ~on_roof(places, 1.0) & found.known
     assert (origin[edge] == UNCERTAIN).sum() > 0.2 * edge.sum()
     assert (np.abs(found.height_m[edge] - 6.0) < 0.3).all()
+
+
+def test_gaps_of_two_cells_between_level_ones_count_as_measured_with_twice_the_sigma(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with ScanView(flown(tmp_path, house, lambda x, depth: depth)) as scan:
+        cloud, found = scan.fused.cloud, scan.raster(CELL_M)
+        points = rasterise_points(scan.xyz_m, cloud.rgb, cloud.sigma_m, scan.grid(CELL_M))
+    more = found.known & ~points.known
+    assert more.sum() > 50
+    height_m = found.height_m[more]  # of the ground or the roof, nothing in between
+    assert (np.minimum(np.abs(height_m), np.abs(height_m - 6.0)) < 0.2).all()
+    usual_m = np.median(points.sigma_m[points.known])
+    assert np.median(found.sigma_m[more]) == pytest.approx(2.0 * usual_m, rel=0.2)
+    wide = ndimage.distance_transform_edt(~points.known) > 2.0
+    assert wide.any() and not found.known[wide].any()
