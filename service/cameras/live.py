@@ -80,6 +80,8 @@ class LiveConfig:
     stall_s: float = 3.0  # no image for this long: reopen
     frozen_s: float = 8.0  # the same image for this long: reopen
     changed_s: float = 1.0  # images of another shape for this long: no fault of the stream
+    steady_s: float = 60.0  # a shape that stays for less makes the next change take twice as long,
+    longest_changed_s: float = 16.0  # or at most so long: a stream that flips is not many scans
     first_retry_s: float = 0.25
     longest_retry_s: float = 5.0
 
@@ -145,6 +147,7 @@ class LiveSource(CameraSource):
         self._closed = Event()
         self._iterated = False
         self._next: tuple[U8, int] | None = None  # the first one that is of another shape to stay
+        self._changed_s = self.config.changed_s  # before the next one ends it
         self._is_silent = False  # at the last attempt
         self._images = self._connect()
         first = next(self._images, None)
@@ -175,6 +178,9 @@ class LiveSource(CameraSource):
             return None
         image, time_ns = self._next
         self._first, self._next = (image, 0), None
+        is_steady = time_ns >= 1e9 * self.config.steady_s
+        longer_s = min(2.0 * self._changed_s, self.config.longest_changed_s)
+        self._changed_s = self.config.changed_s if is_steady else longer_s
         self._start_ns += time_ns
         self.start_monotonic_ns, self.epoch_unix_ns = self._start_ns, time.time_ns()
         self.size_px = self._given_px
@@ -196,7 +202,7 @@ class LiveSource(CameraSource):
             if fitting is None:
                 if odd_px != self._given_px:
                     odd_ns, odd_px = time_ns, self._given_px
-                if time_ns - odd_ns >= 1e9 * self.config.changed_s:
+                if time_ns - odd_ns >= 1e9 * self._changed_s:
                     self._next = image, time_ns
                     return
                 continue

@@ -400,6 +400,17 @@ def test_a_shape_that_stays_is_another_sources() -> None:
     assert source.losses == losses
 
 
+def test_a_stream_that_flips_between_two_shapes_is_not_many_scans() -> None:
+    clips = [clip(15), clip(15, (96, 64))] * 20  # 0.3 s each
+    source = LiveSource(opener(*clips), "test", replace(QUICK, changed_s=0.1))
+    for size_px in ((64, 48), (96, 64)):
+        assert source.size_px == size_px and len(list(source)) > 0
+        assert source.following() is source
+    assert len(take(source, 60)) == 60 and source.misfits > 30
+    assert source.following() is None and source.size_px == (64, 48)
+    source.close()
+
+
 def test_a_source_that_nothing_follows_is_closed() -> None:
     opened = list[RealTime]()
 
