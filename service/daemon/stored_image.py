@@ -19,7 +19,11 @@ BELOW_SEA = b"\1"
 
 def store_image(path: Path, image: U8, tag: KeyframeReport | None = None) -> None:
     """Write ``image`` (H, W, 3) BGR with the position of ``tag`` in EXIF; OSError when the disk
-    has no room."""
+    has no room.
+
+    One with a ``tag`` is written through to the disk. Others come five times a second while the
+    computer is overloaded: what waits for the disk then loses images.
+    """
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -30,8 +34,9 @@ def store_image(path: Path, image: U8, tag: KeyframeReport | None = None) -> Non
     part = path.with_suffix(".part")
     with part.open("wb") as file:
         Image.fromarray(image[:, :, ::-1]).save(file, "JPEG", quality=QUALITY, exif=exif)
-        file.flush()
-        os.fsync(file.fileno())  # it is reported as taken; a power cut may not leave it empty
+        if tag is not None:  # it is reported as taken; a power cut may not leave it empty
+            file.flush()
+            os.fsync(file.fileno())
     os.replace(part, path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from onboard import Onboard, real_scan
 from paths import FULL_DISK
+from spied import spied
 
 from mavlink.component.camera import KeyframeReport
 from mavlink.component.control import Result
@@ -98,8 +100,12 @@ def test_a_photo_in_a_steady_hover_is_an_image_with_its_tag(tmp_path: Path) -> N
         assert tags.geotag.alt_amsl_m == pytest.approx(62.25, abs=0.01)
 
 
-def test_a_photo_without_telemetry_has_the_place_by_vision_or_none(tmp_path: Path) -> None:
+def test_a_photo_without_telemetry_has_the_place_by_vision_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    syncs = spied(monkeypatch, os, "fsync")
     store_image(tmp_path / image_name(START_NS), IMAGE, KeyframeReport())
+    assert syncs.called  # it outlasts a power cut
     assert read_tags(tmp_path / image_name(START_NS)).geotag is None
     below = KeyframeReport(lat_deg=31.5, lon_deg=-35.5, alt_amsl_m=-430.0)
     store_image(tmp_path / "dead_sea.jpg", IMAGE, below)
