@@ -20,6 +20,7 @@ from typing import Any
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import M_PER_DEG
 from recon.frames import rotation_from_rpy, rpy_from_rotation
+from service.cameras.geo_file import MAX_HEIGHT_M
 from service.cameras.lens import Lens, finite_number, finite_numbers, lens_of
 from service.cameras.source import GeoTag
 from service.cameras.xmp import xmp_values
@@ -271,8 +272,8 @@ def _altitude(gps: dict[int, Any], xmp: dict[str, str]) -> tuple[float | None, D
     altitude = finite_number(gps.get(6))
     if altitude is not None:
         below = gps.get(5) in (1, b"\x01", 3, b"\x03")
-        if getattr(gps[6], "numerator", 0) >= 1 << 31:  # below zero, as a Yuneec E10T writes it
-            altitude -= (1 << 32) / gps[6].denominator
+        if altitude > MAX_HEIGHT_M:  # below zero in an unsigned number, as a Yuneec E10T writes it
+            altitude -= (1 << 32) / getattr(gps[6], "denominator", 1)
         readings.append(Reading("EXIF", (-altitude if below else altitude,), _step(gps.get(6))))
     if (absolute := finite_number(text := xmp.get("AbsoluteAltitude", ""))) is not None:
         readings.append(Reading("XMP", (absolute,), _last_digit(text)))
@@ -295,6 +296,7 @@ def _geotag(
     stated = across or _plausible(finite_number(gps.get(31)))
     step_m = 0.0 if place is None or place.step_m < DIFFER_M else place.step_m
     lat, lon = (None, None) if place is None else place.value
+    datum = "ellipsoid" if xmp.get("AltitudeType", "").strip() == "RtkAlt" else ""
     return GeoTag(
         lat_deg=lat,
         lon_deg=lon,
@@ -304,7 +306,8 @@ def _geotag(
         is_sigma_h_stated=stated is not None,
         ypr_deg=ypr_deg,
         relative_alt_m=relative_m,
-        datum="ellipsoid" if xmp.get("AltitudeType", "").strip() == "RtkAlt" else "",
+        datum=datum,
+        is_pressure_altitude=relative_m is not None and not datum,
     )
 
 

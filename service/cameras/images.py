@@ -164,7 +164,7 @@ class ImagesSource(CameraSource):
             named = by_camera(tagged, lambda t: t.model) | by_camera(tagged, size_of) | cameras
             if chosen in named:
                 return named[chosen]
-            known = ", ".join(filter(None, [*cameras, *named]))
+            known = ", ".join(filter(None, cameras | named))
             raise InputError(f"{self.description}: no images of camera {chosen!r}, but of {known}")
         if len(cameras) - ("" in cameras) < 2:
             return tagged

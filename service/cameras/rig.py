@@ -197,7 +197,7 @@ class Rig:
         if tag.lat_deg is not None and tag.lon_deg is not None:
             self.georeference = "exif"
             self.vertical_datum = self.vertical_datum or tag.datum
-            self.is_pressure_altitude |= tag.relative_alt_m is not None
+            self.is_pressure_altitude |= tag.is_pressure_altitude
             usual_m = TAG_HEIGHT_M if tag.relative_alt_m is None else BAROMETER_M
             if tag.is_sigma_h_stated:
                 usual_m = min(usual_m, VERTICAL_SHARE * tag.sigma_h_m)

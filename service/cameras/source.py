@@ -34,6 +34,7 @@ class GeoTag:
     sigma_v_m: float | None = None  # of the altitude; None: not stated
     is_sigma_h_stated: bool = False
     datum: str = ""  # of the altitude where it is stated, as for service.georeference.vertical_code
+    is_pressure_altitude: bool = False  # it is that of air pressure in standard weather
     ypr_deg: tuple[float, float, float] | None = None
     """Yaw from true north, pitch, roll of the gimbal head (FRD in NED); pitch -90 looks down."""
     is_yaw_known: bool = True  # False: the aircraft's own headings contradict it

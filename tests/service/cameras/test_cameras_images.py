@@ -453,8 +453,11 @@ def test_of_several_named_cameras_the_one_that_sees_most_counts(tmp_path: Path) 
     for chosen, letter in (("ZoomCamera", "Z"), ("32x24", "T")):
         names = [f.name for f in open_camera(f"images:{tmp_path}?camera={chosen}")]
         assert names == [f"DJI_{i}_{letter}.jpg" for i in range(3)]
-    with pytest.raises(InputError, match="of camera 'Wide', but of InfraredCamera, WideCamera, Z"):
+    with pytest.raises(
+        InputError, match="of camera 'Wide', but of InfraredCamera, WideCamera, Z"
+    ) as e:
         open_camera(f"images:{tmp_path}?camera=Wide")
+    assert str(e.value).count("WideCamera") == 1
 
 
 def test_of_two_unnamed_cameras_of_one_size_the_wider_counts(tmp_path: Path) -> None:
@@ -555,6 +558,22 @@ def test_a_height_of_an_rtk_receiver_is_above_the_ellipsoid(tmp_path: Path) -> N
     assert datums == ["ellipsoid", ""]
 
 
+def test_altitudes_of_a_drone_are_by_air_pressure_but_of_rtk_or_a_survey_not(
+    tmp_path: Path,
+) -> None:
+    gps = gps_tags(TRUE_LAT, TRUE_LON, 350.0, (12, 0, 0))
+    for name, kind in (("a", "RtkAlt"), ("b", "GpsFusionAlt")):
+        packet = dji(AltitudeType=kind, RelativeAltitude="+50.0")
+        write_still(tmp_path / f"{name}.jpg", gps=gps, xmp=packet)
+    tags = [read_tags(tmp_path / f"{name}.jpg").geotag for name in "ab"]
+    assert [tag and tag.is_pressure_altitude for tag in tags] == [False, True]
+    (tmp_path / "geo.txt").write_text(f"EPSG:4326\nb.jpg {TRUE_LON} {TRUE_LAT} 412.5\n")
+    tags = [frame.geotag for frame in open_camera(str(tmp_path))]
+    assert [tag and (tag.relative_alt_m, tag.is_pressure_altitude) for tag in tags] == [
+        (50.0, False)
+    ] * 2
+
+
 @pytest.mark.parametrize("below", [b"\0", b"\1"])
 def test_an_altitude_below_zero_in_an_unsigned_number_is_read(tmp_path: Path, below: bytes) -> None:
     """As a Yuneec E10T writes -28.41 m; where the letter says below, too, it is above."""
@@ -566,6 +585,14 @@ def test_an_altitude_below_zero_in_an_unsigned_number_is_read(tmp_path: Path, be
     path.write_bytes(data.replace(struct.pack(f"{order}LL", 77_777, 1000), as_written))
     tag = next(iter(open_camera(str(tmp_path)))).geotag
     assert tag is not None and tag.alt_amsl_m == pytest.approx(28.41 if below == b"\1" else -28.41)
+
+
+def test_an_altitude_in_fine_steps_is_read_as_stated(tmp_path: Path) -> None:
+    """Its numerator alone does not tell that it is below zero."""
+    gps = gps_tags(31.19, 120.93, 0.0, (12, 0, 0)) | {6: IFDRational(3_000_000_000, 10_000_000)}
+    write_still(tmp_path / "a.jpg", gps=gps)
+    tag = read_tags(tmp_path / "a.jpg").geotag
+    assert tag is not None and tag.alt_amsl_m == pytest.approx(300.0)
 
 
 def test_altitudes_of_two_datums_are_not_mixed(tmp_path: Path) -> None:

@@ -106,13 +106,12 @@ def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     prior = some.prior(None, tag)
     assert some.georeference == "exif" and prior.agl_m == 80.0
     assert some.is_altitude_assumed and not rig().is_altitude_assumed
-    assert some.is_pressure_altitude  # of a drone, which measures both heights by its barometer
+    assert not some.is_pressure_altitude
+    some.prior(None, replace(tag, is_pressure_altitude=True))
+    assert some.is_altitude_assumed and some.is_pressure_altitude
     some.prior(None, replace(tag, sigma_v_m=3.4))
     assert not some.is_altitude_assumed
     bare = rig().prior(None, replace(tag, relative_alt_m=None))
-    phone = rig()
-    phone.prior(None, replace(tag, relative_alt_m=None))
-    assert phone.is_altitude_assumed and not phone.is_pressure_altitude
     assert prior.sigma_position_m is not None and bare.sigma_position_m is not None
     assert prior.sigma_position_m[2] < 10.0 < bare.sigma_position_m[2]  # a drone's barometer
     stated = rig().prior(None, replace(tag, relative_alt_m=None, sigma_v_m=3.4))
