@@ -1,12 +1,13 @@
 """The mesh of a scan that has ended: made unasked, as the portal shows a finished scan by it.
 
-It waits until no scan grows and nothing that was asked for waits, and is a process of low priority.
+It waits until no scan grows and nothing that was asked for waits, and is a process of low priority,
+which also stops for what is asked for meanwhile and then begins again.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -27,31 +28,37 @@ KIND, FILE = "glb", "mesh.glb"
 MOST_POINTS = 20_000_000
 """A larger scan has a mesh in tiles, which one page does not hold."""
 
+MESH_S = 7200.0
+"""One mesh may take so long; a scan may come from a stranger."""
+
 
 def queue_mesh(jobs: Jobs, folder: Path, may_begin: Callable[[], bool]) -> None:
     """Have the mesh of the finished scan in ``folder`` made once ``may_begin``; nothing happens
-    where there is one, or packages or the disk do not permit it."""
-    with contextlib.suppress(*UNREADABLE):
+    where there is one. The log says why a scan gets none."""
+    try:
         facts = facts_of(folder)
         points = facts.get("counts", {}).get("points", 0)
-        has_place = facts["origin"] is not None
         if not facts["finished"] or is_current(folder / FILE) or not 0 < points <= MOST_POINTS:
             return
-        if (why := obstacle(KIND, has_place)) is None:
-            check_room(round(points * PRODUCTS[KIND][2]), folder)
-            jobs.start(folder, KIND, partial(_make, folder), may_begin=may_begin)
-        else:
-            log.info("%s gets no mesh: it %s", folder, why)
+        why = obstacle(KIND, is_placed=facts["origin"] is not None)
+        if why is not None:
+            raise InputError(f"it {why}")
+        check_room(round(points * PRODUCTS[KIND][2]), folder)
+        jobs.start(folder, KIND, partial(_make, folder), may_begin=may_begin)
+    except UNREADABLE as error:
+        log.info("%s gets no mesh: %s", folder, error)
 
 
 def _make(folder: Path, progress: Progress) -> str:
-    """Run ``skyrelief mesh``; the name of its file. Raises InputError with its last line."""
+    """Run ``skyrelief mesh``; the name of its file. Raises InputError with its last line, or when
+    it takes too long."""
+    deadline = time.monotonic() + MESH_S
 
     def goes_on(line: str) -> bool:
         follow(progress, line.removeprefix("mesh: "))
-        return True
+        return time.monotonic() < deadline
 
     fault = run_to_end("mesh", python_command("service.cli", "mesh", str(folder)), goes_on)
-    if fault:
-        raise InputError(fault)
+    if fault or time.monotonic() >= deadline:
+        raise InputError(fault or f"it takes longer than {MESH_S:.0f} s")
     return FILE

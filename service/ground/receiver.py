@@ -420,4 +420,4 @@ class Receiver:
             trouble, is_due = write_files(effect.folder, self._deliver)
             one.put(drone.Written(effect.scan, trouble, is_due))
             if effect.is_whole and not trouble:
-                self._ended(effect.folder)
+                guarded(f"end of {effect.folder}", partial(self._ended, effect.folder))

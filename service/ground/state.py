@@ -16,7 +16,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from starlette.requests import HTTPConnection
 
-from service.errors import InputError, MissingError, SkyreliefError
+from service.errors import InputError, MissingError, OutsideError, SkyreliefError
 from service.ground.basemap import Basemap
 from service.ground.library import Library
 from service.ground.live_map import LiveMap
@@ -32,6 +32,8 @@ from service.workers import Worker, Workers, guarded
 log = logging.getLogger(__name__)
 
 MAX_WAITING_JOBS = 20
+"""Of those asked for, and as many others."""
+
 SILENT_S = 10.0
 """A scan from which nothing was heard for so long does not grow."""
 
@@ -62,6 +64,7 @@ class Job:
     ended_unix_s: float | None = None
     work: Callable[[Progress], str] | None = None  # what makes it; None: its kind says
     may_begin: Callable[[], bool] | None = None  # of one that nobody asked for
+    gives_way: bool = False  # stops for one that was asked for, and begins again
     options: ExportOptions = field(default_factory=ExportOptions)
     progress: Progress = field(default_factory=Progress)
 
@@ -123,6 +126,7 @@ class Jobs:
         self._lock = threading.Lock()
         self._jobs: list[Job] = []  # replaced, not changed, so that anybody may iterate over it
         self._number = 0
+        self._is_closed = False
 
     def start(
         self,
@@ -135,22 +139,33 @@ class Jobs:
         """Queue a job, or ``work``; the one there is where it is asked for twice.
 
         With ``may_begin`` nobody asks for it: it begins when that is true and nothing else waits,
-        and is forgotten if it fails. InputError for an unknown kind or a full queue.
+        gives way to what is asked for, and is forgotten if it fails. InputError for an unknown kind
+        or a full queue, OutsideError once closed.
         """
         if work is None and kind not in KINDS:
             raise InputError(f"kind is one of {', '.join(KINDS)}")
         options = options or ExportOptions()
         asked = (folder, kind, options)
         with self._lock:
-            for job in self._jobs if work is None or may_begin else ():
-                if not job.has_ended and (job.folder, job.kind, job.options) == asked:
+            if self._is_closed:
+                raise OutsideError("the ground station ends")
+            current = [job for job in self._jobs if not job.has_ended]
+            for job in current if work is None or may_begin else ():
+                is_before = may_begin is not None and job.state == "running"  # of an older scan
+                if (job.folder, job.kind, job.options) == asked and not is_before:
                     job.may_begin = job.may_begin and may_begin
                     return job.shown()
-            if sum(not job.has_ended for job in self._jobs) >= MAX_WAITING_JOBS:
+            alike = [job for job in current if (job.may_begin is None) == (may_begin is None)]
+            if len(alike) >= MAX_WAITING_JOBS:
                 raise InputError("too many deliverables are waiting; try again later")
+            for job in current if may_begin is None else ():
+                if job.state == "running" and job.may_begin is not None:
+                    job.gives_way = True
+                    job.progress.cancel()
             self._number += 1
             job = Job(self._number, folder, kind, work=work, may_begin=may_begin, options=options)
-            self._jobs = [*self._jobs[-KEPT:], job]
+            older = [one for one in self._jobs[:-KEPT] if not one.has_ended]
+            self._jobs = [*older, *self._jobs[-KEPT:], job]
             if self._worker is None or self._worker.is_done:
                 self._worker = self._workers.start("exports", self._work)
             return job.shown()
@@ -178,15 +193,19 @@ class Jobs:
             found = [j for j in self._jobs if j.number == number and not j.has_ended]
             if not found:
                 raise MissingError(f"no job {number} is waiting or running")
+            found[0].gives_way = False
             found[0].progress.cancel()
             if found[0].state == "waiting":
                 found[0].end("cancelled")
             return found[0].shown()
 
     def close(self) -> None:
-        """Cancel all jobs; wait a while until the one that runs has left its files."""
+        """Cancel all jobs, take no more, and wait a while until the one that runs has left its
+        files."""
         with self._lock:
+            self._is_closed = True
             for job in self._jobs:
+                job.gives_way = False
                 job.progress.cancel()
                 if job.state == "waiting":
                     job.end("cancelled")
@@ -201,12 +220,14 @@ class Jobs:
                 if not waiting:
                     self._worker = None
                     return
-                waiting.sort(key=lambda job: job.may_begin is not None)  # what is asked for first
-                job = next((j for j in waiting if j.may_begin is None or j.may_begin()), None)
-                if job is not None:
+                # What is asked for first; the others wait for the same.
+                job = min(waiting, key=lambda job: job.may_begin is not None)
+                begins = job.may_begin is None or job.may_begin()
+                if begins:
                     job.state = "running"
-            if job is None:
-                worker.stop.wait(LOOK_S)
+            if not begins:
+                if worker.stop.wait(LOOK_S):
+                    return
                 continue
             job.progress.begin()
             guarded("exports", partial(self._run, job))
@@ -215,18 +236,22 @@ class Jobs:
                 with self._lock:
                     self._jobs = [one for one in self._jobs if one is not job]
             elif job.state == "done":
-                self.made(job)
+                guarded("exports", partial(self.made, job))
 
     def _run(self, job: Job) -> None:
         try:
             job.file = self.carry_out(job)
             job.end("done")
         except CancelledError:
-            job.end("cancelled")
+            with self._lock:
+                if job.gives_way:
+                    job.state, job.gives_way, job.progress = "waiting", False, Progress()
+                else:
+                    job.end("cancelled")
         except SkyreliefError as error:
             job.end("failed", str(error))
         finally:
-            if not job.has_ended:  # our own fault, which the caller logs
+            if job.state == "running":  # our own fault, which the caller logs
                 job.end("failed", "failed; see the log")
 
 

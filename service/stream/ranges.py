@@ -92,11 +92,13 @@ class RangeSet:
 
     def newest_first(self) -> Iterator[int]:
         """The numbers, largest first."""
-        for first, last in reversed(self._ranges()):
-            yield from range(last, first - 1, -1)
+        for at in range(len(self._edges) - 1, 0, -2):  # of many ranges often only the last counts
+            yield from range(self._edges[at] - 1, self._edges[at - 1] - 1, -1)
 
     def __sub__(self, other: RangeSet) -> RangeSet:
         """The numbers that are not in ``other``."""
+        if not self or self == other:  # most often
+            return RangeSet()
         edges = np.union1d(self._edges, other._edges)
         own, taken = (np.searchsorted(s._edges, edges, "right") % 2 for s in (self, other))
         out = RangeSet()
@@ -120,7 +122,9 @@ class RangeSet:
 
     def pairs(self) -> Pairs:
         """The ranges (first, last), in order; at most the newest MAX_RANGES."""
-        return self._ranges()[-MAX_RANGES:]
+        newest = RangeSet()
+        newest._edges = self._edges[-2 * MAX_RANGES :]
+        return newest._ranges()
 
     def text(self) -> str:
         """The ranges as ``1-5,7``, for a key expression."""

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from loopback import until
 
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.ground.portal import Portal, PortalConfig
-from service.ground.state import Job, Jobs
+from service.ground.state import KEPT, MAX_WAITING_JOBS, Job, Jobs
 from service.offline.exports.view import ExportOptions
 from service.workers import Workers
 
@@ -131,3 +131,69 @@ def test_what_nobody_asked_for_fails_in_silence(tmp_path: Path) -> None:
     assert until(lambda: not jobs.listed())
     jobs.start(tmp_path, "glb")
     assert until(lambda: [job["state"] for job in jobs.listed()] == ["failed"])
+
+
+def test_what_nobody_asked_for_takes_no_room_from_the_others(tmp_path: Path) -> None:
+    """As after a card with hundreds of scans was taken in while another scan grows."""
+    may_begin = threading.Event()
+    jobs = Jobs(Workers(), lambda job: f"{job.folder.name}.{job.kind}")
+    for n in range(MAX_WAITING_JOBS):
+        jobs.start(tmp_path / str(n), "glb", may_begin=may_begin.is_set)
+    with pytest.raises(InputError, match="too many"):
+        jobs.start(tmp_path / "more", "glb", may_begin=may_begin.is_set)
+    for _ in range(KEPT + 5):
+        number = jobs.start(tmp_path / "asked", "kml")["number"]
+        assert until(lambda: not jobs.busy(tmp_path / "asked"))
+    assert number > KEPT
+    may_begin.set()
+    made = [tmp_path / str(n) for n in range(MAX_WAITING_JOBS)]
+    assert until(lambda: all(jobs.of(folder)[0]["state"] == "done" for folder in made))
+
+
+def test_a_running_job_that_nobody_asked_for_gives_way_and_begins_again(tmp_path: Path) -> None:
+    order, began = list[str](), threading.Semaphore(0)
+
+    def carry_out(job: Job) -> str:
+        order.append(job.kind)
+        began.release()
+        while job.kind == "glb" and len(order) < 3:
+            job.progress("meshing")
+        return "mesh.glb"
+
+    jobs = Jobs(Workers(), carry_out)
+    jobs.start(tmp_path, "glb", may_begin=lambda: True)
+    assert began.acquire(timeout=10.0)
+    jobs.start(tmp_path, "kml")
+    assert until(lambda: [job["state"] for job in jobs.of(tmp_path)] == ["done", "done"])
+    assert order == ["glb", "kml", "glb"]
+    order.clear()
+    number = jobs.start(tmp_path, "glb", may_begin=lambda: True)["number"]
+    assert until(lambda: len(order) == 1)
+    again = jobs.start(tmp_path, "glb", may_begin=lambda: True)["number"]
+    assert again > number  # the scan has changed since that one began
+    jobs.cancel(again)
+    jobs.cancel(number)
+    assert until(lambda: [job["state"] for job in jobs.of(tmp_path)][2:] == ["cancelled"] * 2)
+
+
+def test_nothing_begins_once_the_station_closes(tmp_path: Path) -> None:
+    """The receiver closes after the portal, and says that a scan has ended."""
+    jobs = Jobs(Workers(), lambda _: "mesh.glb")
+    waiting = jobs.start(tmp_path, "glb", may_begin=lambda: False)["number"]
+    jobs.close()
+    assert [job["state"] for job in jobs.of(tmp_path)] == ["cancelled"]
+    for may_begin in (None, lambda: True):
+        with pytest.raises(OutsideError, match="ends"):
+            jobs.start(tmp_path, "glb", may_begin=may_begin)
+    assert [job["number"] for job in jobs.listed()] == [waiting]
+
+
+def test_a_fault_in_what_follows_a_job_does_not_stop_the_others(tmp_path: Path) -> None:
+    def made(_: Job) -> None:
+        raise RuntimeError("can't start new thread")
+
+    jobs = Jobs(Workers(), lambda _: "scan.kml")
+    jobs.made = made
+    for kind in ("kml", "laz"):
+        jobs.start(tmp_path, kind)
+    assert until(lambda: [job["state"] for job in jobs.of(tmp_path)] == ["done", "done"])

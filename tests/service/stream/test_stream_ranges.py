@@ -5,7 +5,13 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.stream.ranges import RangeSet, ranges_from_pairs, ranges_from_text
+from service.stream.ranges import (
+    MAX_NUMBER,
+    MAX_RANGES,
+    RangeSet,
+    ranges_from_pairs,
+    ranges_from_text,
+)
 
 NUMBERS = st.sets(st.integers(0, 40))
 
@@ -41,7 +47,7 @@ def test_text_and_pairs_round_trip(numbers: set[int]) -> None:
         assert ranges_from_text(ranges.text()) == ranges
 
 
-@given(st.text(max_size=30))
+@given(st.text(max_size=30) | st.text("0123456789,-", max_size=30))
 def test_any_text_gives_ranges_or_none(text: str) -> None:
     ranges = ranges_from_text(text)
     assert ranges is None or ranges_from_text(ranges.text()) == ranges
@@ -60,3 +66,24 @@ def test_foreign_json_gives_none() -> None:
         [[True, 1]],
     ):
         assert ranges_from_pairs(raw) is None
+
+
+def test_largest_numbers_are_held_and_larger_ones_refused() -> None:
+    last = RangeSet([(MAX_NUMBER - 1, MAX_NUMBER)])
+    assert ranges_from_text(last.text()) == last and last.last == MAX_NUMBER
+    assert (RangeSet([(0, MAX_NUMBER)]) - last).pairs() == [(0, MAX_NUMBER - 2)]
+    assert ranges_from_text(f"{MAX_NUMBER + 1}") is None
+
+
+def test_a_range_without_its_end_is_none() -> None:
+    assert ranges_from_text("5") == RangeSet([(5, 5)])
+    for text in ("5-", "-5", "5-4", "5\n", "5,", ""):
+        assert ranges_from_text(text) is None, text
+
+
+def test_a_message_holds_the_newest_of_too_many_ranges() -> None:
+    many = RangeSet.of(range(0, 2 * (MAX_RANGES + 10), 2))
+    assert many.pairs() == [(n, n) for n in list(many)[-MAX_RANGES:]]
+    assert ranges_from_text(many.text()) is None
+    most = RangeSet(many.pairs())
+    assert ranges_from_text(most.text()) == most
