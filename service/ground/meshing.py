@@ -40,7 +40,7 @@ def queue_mesh(jobs: Jobs, folder: Path, may_begin: Callable[[], bool]) -> None:
         points = facts.get("counts", {}).get("points", 0)
         if not facts["finished"] or is_current(folder / FILE) or not 0 < points <= MOST_POINTS:
             return
-        why = obstacle(KIND, is_placed=facts["origin"] is not None)
+        why = obstacle(KIND, facts["origin"] is not None)
         if why is not None:
             raise InputError(f"it {why}")
         check_room(round(points * PRODUCTS[KIND][2]), folder)
