@@ -53,12 +53,13 @@ def serving(
     deliver: Callable[[Path], None] = lambda _: None,
     opened: Callable[[ReceivedScan], None] = lambda _: None,
     workers: Workers | None = None,
+    ended: Callable[[Path], None] = lambda _: None,
 ) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     session = SessionConfig(mode="router", listen=(endpoint,))
     config = ReceiverConfig(folder, session, limits or DroneLimits(), "base")
-    ground = Receiver(config, workers, deliver, opened)
+    ground = Receiver(config, workers, deliver, opened, ended)
     ground.start()
     try:
         yield ground, endpoint
@@ -237,6 +238,23 @@ def test_deliverables_that_fail_are_said_and_stop_no_others(tmp_path: Path) -> N
         assert entry["drone"] == "evil" and "KeyError" in entry["trouble"]
         assert arrives(tmp_path, endpoint)
         assert until(lambda: written == ["honest"])
+
+
+def test_a_fault_in_what_follows_the_end_of_a_scan_stops_nothing(tmp_path: Path) -> None:
+    """Its alignment and its mesh."""
+    ends = list[str]()
+
+    def ended(folder: Path) -> None:
+        ends.append(folder.parent.name)
+        if folder.parent.name == "evil":
+            raise RuntimeError("can't start new thread")
+
+    with serving(tmp_path / "ground", ended=ended) as (ground, endpoint):
+        for drone in ("evil", "honest"):
+            assert arrives(tmp_path, endpoint, drone)
+            assert until(lambda: drone in ends)  # noqa: B023
+        (writer,) = [w for w in ground.workers.report() if w["name"] == "deliverables"]
+        assert ends == ["evil", "honest"] and not writer["restarts"]
 
 
 def test_junk_makes_no_folder(tmp_path: Path) -> None:
