@@ -188,7 +188,7 @@ def _target(folder: Path, out: Path | None) -> Iterator[Path]:
 
 def _check_finished(folder: Path) -> None:
     """Raise InputError for a folder without a finished scan of two keyframes or more."""
-    with finished_store(folder, "refine") as store:
+    with finished_store(folder, "refine", repairs=True) as store:
         count = len(store.seqs())
     if count < 2:
         raise InputError(f"{folder} holds {count} keyframe(s); refining takes two or more")

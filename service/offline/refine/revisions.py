@@ -25,7 +25,7 @@ from service.cameras.rig import attitude_of
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.stream import codec
-from service.stream.database import Statement, blob, json_object
+from service.stream.database import Statement, blob, can_write, json_object
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -200,11 +200,15 @@ class Revisions:
         )
 
 
-def finished_store(folder: Path, what: str) -> ScanStore:
-    """The store of a finished scan, only to be read; InputError where there is none to ``what``."""
-    if not (folder / "scan.db").is_file():
+def finished_store(folder: Path, what: str, repairs: bool = False) -> ScanStore:
+    """The store of a finished scan, only to be read; InputError where there is none to ``what``.
+
+    With ``repairs`` it is opened to be changed where it can be, which repairs a damaged one.
+    """
+    path = folder / "scan.db"
+    if not path.is_file():
         raise InputError(f"{folder} contains no scan.db; give a scan folder")
-    store = ScanStore.open(folder / "scan.db", read_only=True)
+    store = ScanStore.open(path, read_only=not (repairs and can_write(path)))
     if store.finished:
         return store
     store.close()

@@ -29,6 +29,7 @@ from service.offline.refine.refinement import RefineOptions, refine, undo
 from service.offline.refine.revisions import REFINED, Revisions
 from service.offline.refine.survey_file import at_times, read_survey
 from service.stream.codec import encode
+from service.stream.database import is_sound
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -547,6 +548,18 @@ def test_scans_that_cannot_be_refined_say_why(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no georeference"):
         refine(local.scan, RefineOptions(telemetry=log))
     assert refine(local.scan, RefineOptions())["moved_m"]["most"] < 1e-3
+
+
+def test_a_damaged_scan_is_repaired_before_it_is_refined(tmp_path: Path) -> None:
+    scan = fly(tmp_path, keyframes=6).scan
+    path = scan / "scan.db"
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2 // 4096 * 4096
+    data[middle : middle + 8192] = bytes(8192)
+    path.write_bytes(data)
+    assert not is_sound(path)
+    assert refine(scan, RefineOptions())["moved_m"]["most"] < 1e-3
+    assert is_sound(path) and (scan / "scan.db.damaged").is_file()
 
 
 GOOD = "name,keyframe_seq,u_px,v_px,lat,lon,alt_amsl_m\n"
