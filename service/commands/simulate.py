@@ -147,16 +147,17 @@ def simulate(given: SimulateOptions) -> None:
         _play(given)
         return
     started = time.monotonic()
-    with refusing("simulate"), showing("simulate") as progress:
-        progress("laying out the site")
+    with refusing("simulate"):
         from service.scans.writing import check_writable, filling_folder
-        from service.sim import recording
 
-        options = given.simulation()
         if any((given.out / name).exists() for name in ("flight.mp4", "truth")):
             raise InputError(f"{given.out} already holds a flight; give another folder with --out")
         check_writable(given.out, is_folder=True)
-        simulation = recording.prepare(options)
+    with refusing("simulate"), showing("simulate") as progress:
+        progress("laying out the site")
+        from service.sim import recording
+
+        simulation = recording.prepare(given.simulation())
     with showing("simulate") as progress, filling_folder(given.out) as part:
 
         def rendered(done: int, total: int) -> None:

@@ -13,6 +13,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -781,12 +782,17 @@ def test_a_command_that_falls_silent_is_ended(
 
 
 def test_a_pipeline_is_asked_to_close_its_sockets(tmp_path: Path) -> None:
-    """By SIGINT: at SIGTERM it ends at once, and who sends to it waits 5 s for an answer."""
+    """By SIGINT: at SIGTERM it ends at once, and who sends to it waits 5 s for an answer.
+
+    A shell in its place could not trap SIGINT where the tests themselves run with it ignored.
+    """
     launcher, asked = tmp_path / "gst-launch-1.0", tmp_path / "asked"
     (tmp_path / "clip").write_bytes(clip(5))
     launcher.write_text(
-        f"#!/bin/sh\ntrap 'touch {asked}; exit' INT\ncat {tmp_path}/clip\n"
-        "while :; do sleep 0.05; done\n"
+        f"#!{sys.executable}\nimport pathlib, shutil, signal, sys, time\n"
+        f"signal.signal(signal.SIGINT, lambda *_: [pathlib.Path({str(asked)!r}).touch(), exit()])\n"
+        f"shutil.copyfileobj(open({str(tmp_path / 'clip')!r}, 'rb'), sys.stdout.buffer)\n"
+        "sys.stdout.flush()\nwhile True: time.sleep(0.05)\n"
     )
     launcher.chmod(0o755)
     live.open_command([str(launcher)], 5.0, {}).close()
