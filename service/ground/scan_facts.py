@@ -6,6 +6,7 @@ no broken text reaches the list.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -116,10 +117,11 @@ def facts_of(folder: Path) -> dict[str, Any]:
 def is_current(product: Path) -> bool:
     """Whether a file was made of the scan beside it as that is now: no older than its
     ``scan.json``."""
-    if not is_regular(product):
-        return False
     summary = product.with_name(SUMMARY)
-    return not summary.exists() or product.stat().st_mtime >= summary.stat().st_mtime
+    with suppress(OSError):  # it is replaced or deleted meanwhile
+        if is_regular(product):
+            return not summary.exists() or product.stat().st_mtime >= summary.stat().st_mtime
+    return False
 
 
 def ground_in(path: Path) -> Ground:

@@ -100,5 +100,13 @@ def test_a_mesh_stays_that_of_its_scan_when_it_is_imported(folder: Path, tmp_pat
     assert not older.entry(*older.take(folder))["meshed"]
 
 
+def test_a_mesh_that_is_deleted_while_the_library_is_read_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scan.json").touch()
+    monkeypatch.setattr("service.ground.scan_facts.is_regular", lambda _: True)  # it was there
+    assert not is_current(tmp_path / "mesh.glb")
+
+
 class FullDisk:
     free, total = 1000, 10**12
