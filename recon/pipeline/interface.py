@@ -51,7 +51,7 @@ class MapperConfig:
 class FramePosed:
     """A frame went through tracking. One that was lost comes again where the next one places it."""
 
-    frame: Frame  # without its images; ``relative`` gives its pose again, as known later
+    frame: Frame  # without its images; gives its pose in the odometry again, as known later
     pose: Pose | None = None  # in the world; by telemetry alone when vision fails
     is_view: bool = False  # the frame takes part in stereo and may become a keyframe
 
