@@ -176,6 +176,7 @@ def _squares(depth: DepthMap, mask: Bool, view: TextureView, detail_levels: floa
     fine = cv2.remap(inverse, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     out = cv2.remap(known.astype(np.uint8), *places, cv2.INTER_NEAREST)
     out[view.bgra[..., 3] == 0] = 0
+    is_blank = out == 0
     for side in SIDES_PX if detail_levels else ():
         rows, cols = h // side, w // side
         whole = np.s_[: rows * side, : cols * side]
@@ -187,7 +188,7 @@ def _squares(depth: DepthMap, mask: Bool, view: TextureView, detail_levels: floa
             return cv2.absdiff(image, cv2.resize(few, image.shape[1::-1]))
 
         busy = off(view.bgra[whole]).max(axis=2) > detail_levels
-        busy |= (off(fine[whole]) > FLAT * fine[whole]) | (fine[whole] == 0.0)
+        busy |= (off(fine[whole]) > FLAT * fine[whole]) | is_blank[whole]
         is_flat = ~busy.reshape(blocks).any(axis=(1, 3))
         square = out[whole].reshape(blocks)
         square[:] = np.where(is_flat[:, None, :, None], 0, square)

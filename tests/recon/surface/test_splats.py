@@ -220,6 +220,17 @@ def test_flat_areas_have_few_gaussians_and_edges_all() -> None:
     assert 20.0 * np.log10(255.0 / error) > 30.0
 
 
+def test_a_flat_area_that_an_image_does_not_show_has_no_gaussian() -> None:
+    depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
+    view = painted(depth)
+    view.bgra[:, 32:] = 0
+    shown = SIZE[0] * SIZE[1] // 2
+    assert 0 < gaussians(keyframe(0, depth), view, 4) <= shown
+    assert gaussians(keyframe(0, depth), view, 0) == shown
+    view.bgra[:] = 0
+    assert gaussians(keyframe(0, depth), view, 4) == 0
+
+
 def test_what_other_views_see_through_is_left_out() -> None:
     up = np.array([0.0, 0.0, 1.0])
     places = [-1.5, 0.0, 1.5, 3.0]
