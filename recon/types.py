@@ -113,7 +113,7 @@ class Pose:
     covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
     sources: tuple[str, ...] = ()  # of "vision", "attitude", "altitude", "gnss"
     scale: float = 1.0  # metres per unit of the odometry: multiplies depths
-    is_aligned: bool = True  # False: nothing tells the scale and heading of its segment yet
+    is_aligned: bool = True  # False: the scale and heading of its segment are unknown yet
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,6 +22,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import IO, Any
 
 from service.errors import OutsideError, SkyreliefError
@@ -336,7 +337,8 @@ def run_process(worker: Worker, row: str, command: Sequence[str]) -> None:
 
 
 def run_to_end(row: str, command: Sequence[str], goes_on: Callable[[str], bool]) -> str:
-    """Run a process of the table with low priority; why it failed, empty when it did not.
+    """Run a process of the table with low priority, the first to go when the machine's memory runs
+    out; why it failed, empty when it did not.
 
     ``goes_on`` gets the last line that it wrote to standard error, every :data:`LOOK_S`; False
     ends the process.
@@ -347,6 +349,7 @@ def run_to_end(row: str, command: Sequence[str], goes_on: Callable[[str], bool])
         try:
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
+                Path(f"/proc/{process.pid}/oom_score_adj").write_text("1000")
             while process.poll() is None:
                 if not goes_on(_last_line(said)):
                     return ""

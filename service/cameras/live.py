@@ -347,7 +347,7 @@ def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
     if place is None or not 0 < int(place[2]) < 65536:
         raise InputError(f"srt:{rest} is not like srt://:9000")
     # Without a limit of its wait for data, in ms, the element does not end when it is asked to, and
-    # a sender learns only by its own timeout of 5 s that nobody listens.
+    # a sender learns only by its own timeout of 5 s that its peer is gone.
     limit = "poll-timeout=100"
     source = ["srtsrc", f"uri=srt:{rest}", limit, *([] if place[1] else ["mode=listener"])]
     description = without_credentials(f"srt:{rest}")

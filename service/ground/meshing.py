@@ -12,6 +12,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import psutil  # type: ignore[import-untyped]
+
 from service.errors import InputError
 from service.ground.library import UNREADABLE
 from service.ground.products import PRODUCTS, obstacle
@@ -25,8 +27,11 @@ from service.workers import python_command, run_to_end
 log = logging.getLogger(__name__)
 
 KIND, FILE = "glb", "mesh.glb"
-MOST_POINTS = 20_000_000
+MAX_POINTS = 20_000_000
 """A larger scan has a mesh in tiles, which one page does not hold."""
+
+BASE_BYTES, POINT_BYTES = 900 << 20, 800
+"""Memory that a mesh takes, whatever its size and for each point of the cloud."""
 
 MESH_S = 7200.0
 """One mesh may take so long; a scan may come from a stranger."""
@@ -38,12 +43,15 @@ def queue_mesh(jobs: Jobs, folder: Path, may_begin: Callable[[], bool]) -> None:
     try:
         facts = facts_of(folder)
         points = facts.get("counts", {}).get("points", 0)
-        if not facts["finished"] or is_current(folder / FILE) or not 0 < points <= MOST_POINTS:
+        if not facts["finished"] or is_current(folder / FILE) or not 0 < points <= MAX_POINTS:
             return
         why = obstacle(KIND, facts["origin"] is not None)
         if why is not None:
             raise InputError(f"it {why}")
         check_room(round(points * PRODUCTS[KIND][2]), folder)
+        needed, free = BASE_BYTES + POINT_BYTES * points, psutil.virtual_memory().available
+        if needed > free:
+            raise InputError(f"it takes {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} are free")
         jobs.start(folder, KIND, partial(_make, folder), may_begin=may_begin)
     except UNREADABLE as error:
         log.info("%s gets no mesh: %s", folder, error)

@@ -115,7 +115,7 @@ def facts_of(folder: Path) -> dict[str, Any]:
 
 
 def is_current(product: Path) -> bool:
-    """Whether a file was made of the scan beside it as that is now: no older than its
+    """Whether a file was made of the scan in its folder as that is now: no older than its
     ``scan.json``."""
     summary = product.with_name(SUMMARY)
     with suppress(OSError):  # it is replaced or deleted meanwhile

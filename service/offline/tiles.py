@@ -126,14 +126,14 @@ def tile_boxes(prints: Sequence[Extent], max_points: int) -> list[Box]:
     if sum(p.points for p in prints) <= max_points:
         return [EVERYWHERE]
     bounds = union(p.box for p in prints)
-    least_m = MIN_SHARE * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    min_m = MIN_SHARE * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
     rest, out = [[*EVERYWHERE]], list[Box]()
     while rest:
         west, south, east, north = box = rest.pop()
         points = sum(p.points * _share(p.box, box) for p in prints)
         inner = np.clip(box, np.tile(bounds[:2], 2), np.tile(bounds[2:], 2))
         axis = int(np.argmax(inner[2:] - inner[:2]))
-        if points > max_points and inner[axis + 2] - inner[axis] > least_m:
+        if points > max_points and inner[axis + 2] - inner[axis] > min_m:
             low, high = box.copy(), box.copy()
             low[axis + 2] = high[axis] = float(0.5 * (inner[axis] + inner[axis + 2]))
             rest += [high, low]

@@ -588,7 +588,7 @@ def test_an_altitude_below_zero_in_an_unsigned_number_is_read(tmp_path: Path, be
 
 
 def test_an_altitude_in_fine_steps_is_read_as_stated(tmp_path: Path) -> None:
-    """Its numerator alone does not tell that it is below zero."""
+    """Its numerator alone does not mean that it is below zero."""
     gps = gps_tags(31.19, 120.93, 0.0, (12, 0, 0)) | {6: IFDRational(3_000_000_001, 10_000_000)}
     write_still(tmp_path / "a.jpg", gps=gps)
     tag = read_tags(tmp_path / "a.jpg").geotag

@@ -72,7 +72,11 @@ def test_nothing_is_made_where_nobody_wants_it_or_it_does_not_fit(
     plain.ended(folder)
     assert not plain.jobs.of(folder)
     portal = portal_of(folder, [], meshes=True)
-    for name, value in (("MOST_POINTS", 10), ("obstacle", lambda *_: "needs the package open3d")):
+    for name, value in (
+        ("MAX_POINTS", 10),
+        ("BASE_BYTES", 1 << 50),
+        ("obstacle", lambda *_: "needs the package open3d"),
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(f"service.ground.meshing.{name}", value)
             portal.ended(folder)
