@@ -4,7 +4,7 @@ With the code numba also loads what it needs only to compile another kernel, so 
 if at all: the kernel's intermediate form (those of a flight's kernels take 16 MiB unpacked), and
 the rules of all operations that it can compile, with LLVM's compiler (30 MiB).
 
-This replaces private functions of numba, and code that calls a symbol which nobody has named ends
+This replaces private functions of numba, and code that calls a symbol without an address ends
 the process: a version of numba comes here only once its own loading has been compared.
 """
 

@@ -63,7 +63,7 @@ class Job:
     queued_unix_s: float = field(default_factory=time.time)
     ended_unix_s: float | None = None
     work: Callable[[Progress], str] | None = None  # what makes it; None: its kind says
-    may_begin: Callable[[], bool] | None = None  # of one that nobody asked for
+    may_begin: Callable[[], bool] | None = None  # of one made unasked
     gives_way: bool = False  # stops for one that was asked for, and begins again
     options: ExportOptions = field(default_factory=ExportOptions)
     progress: Progress = field(default_factory=Progress)
@@ -138,7 +138,7 @@ class Jobs:
     ) -> dict[str, Any]:
         """Queue a job, or ``work``; the one there is where it is asked for twice.
 
-        With ``may_begin`` nobody asks for it: it begins when that is true and nothing else waits,
+        With ``may_begin`` it is made unasked: it begins when that is true and nothing else waits,
         gives way to what is asked for, and is forgotten if it fails. InputError for an unknown kind
         or a full queue, OutsideError once closed.
         """

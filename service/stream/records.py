@@ -68,7 +68,7 @@ def header_from_json(data: bytes) -> ScanHeader | None:
 
 
 def read_header(data: bytes) -> ScanHeader:
-    """The header in ``data``; ValueError says what is wrong with it."""
+    """The header in ``data``; ValueError says where it is invalid."""
     if len(data) > MAX_HEADER_BYTES:
         raise ValueError(f"it has {len(data)} bytes, at most {MAX_HEADER_BYTES} are allowed")
     try:
