@@ -49,6 +49,7 @@ versions=$home/versions
 current=$home/current
 etc=$root/etc/skyrelief
 cache=$root/var/cache/skyrelief
+pkla=etc/polkit-1/localauthority/50-local.d
 
 [[ -n $root || $(id -u) -eq 0 ]] || die "run it as root: sudo $0"
 
@@ -168,6 +169,7 @@ install_files() {
   install -D -m 0644 "$from/deploy/60-skyrelief.rules" "$root/etc/udev/rules.d/60-skyrelief.rules"
   install -D -m 0644 "$from/deploy/50-skyrelief.polkit.rules" \
     "$root/etc/polkit-1/rules.d/50-skyrelief.rules"
+  install -D -m 0644 -t "$root/$pkla" "$from/deploy/50-skyrelief.pkla"
   install -d -m 0755 "$etc"
   [[ $unit == skyrelief && ! -e $etc/skyrelief.toml ]] || return 0
   local settings=()
@@ -189,6 +191,8 @@ prepare_machine() {
     systemctl disable --now nvgetty.service >/dev/null 2>&1 || true
   fi
   udevadm control --reload 2>/dev/null || true
+  # Ports that are there already: nvgetty leaves its own with the group tty until then.
+  udevadm trigger --subsystem-match=tty 2>/dev/null || true
 }
 
 # Compiles the kernels of version $1 as the service's user, before the first flight.
@@ -320,7 +324,8 @@ do_uninstall() {
   rm -rf "$home" "$cache"
   rm -f "$root"/etc/systemd/system/skyrelief{,-ground}.service \
     "$root"/usr/lib/{sysusers.d,tmpfiles.d}/skyrelief.conf \
-    "$root/etc/udev/rules.d/60-skyrelief.rules" "$root/etc/polkit-1/rules.d/50-skyrelief.rules"
+    "$root/etc/udev/rules.d/60-skyrelief.rules" "$root/etc/polkit-1/rules.d/50-skyrelief.rules" \
+    "$root/$pkla/50-skyrelief.pkla"
   if live; then systemctl daemon-reload; fi
   say "removed; $etc and $root/var/lib/skyrelief are kept"
 }

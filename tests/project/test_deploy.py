@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import configparser
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -104,6 +106,7 @@ def test_everything_lands_in_its_place(machine: Machine) -> None:
         "usr/lib/tmpfiles.d/skyrelief.conf",
         "etc/udev/rules.d/60-skyrelief.rules",
         "etc/polkit-1/rules.d/50-skyrelief.rules",
+        "etc/polkit-1/localauthority/50-local.d/50-skyrelief.pkla",
         "opt/skyrelief/current/bin/skyrelief",
     ):
         assert (machine.root / name).is_file(), name
@@ -220,8 +223,20 @@ def test_uninstall_keeps_scans_and_configuration(machine: Machine) -> None:
     assert machine.install("--uninstall").returncode == 0
     assert not machine.home.exists()
     assert not list((machine.root / "etc" / "systemd" / "system").iterdir())
+    assert not list((machine.root / "etc").rglob("*0-skyrelief*"))
     assert scans.is_dir()
     assert (machine.root / "etc" / "skyrelief" / "skyrelief.toml").is_file()
+
+
+def test_both_kinds_of_polkit_allow_the_same() -> None:
+    old = configparser.ConfigParser()
+    old.optionxform = str  # type: ignore[method-assign,assignment]  # polkit's keys have capitals
+    old.read(ROOT / "deploy" / "50-skyrelief.pkla")
+    (group,) = old.sections()
+    rules = (ROOT / "deploy" / "50-skyrelief.polkit.rules").read_text()
+    assert old[group]["Action"].split(";") == re.findall(r'"(org\.[^"]+)"', rules)
+    assert old[group]["Identity"] == "unix-user:skyrelief"
+    assert {old[group][f"Result{who}"] for who in ("Any", "Inactive", "Active")} == {"yes"}
 
 
 def test_wrong_usage_is_reported(machine: Machine) -> None:
