@@ -3,13 +3,15 @@
 A link is written as in pymavlink:
 ``serial:/dev/serial/by-id/NAME:921600``, ``udpin:0.0.0.0:14550`` (also ``udp:``),
 ``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``; and ``lines:0.0.0.0:10110``
-for NMEA 0183 or CSV on UDP (:mod:`mavlink.wire.lines`).
+for NMEA 0183 or CSV on UDP (:mod:`mavlink.wire.lines`). ``serial:///dev/NAME:921600``, as MAVSDK
+writes it, is the same.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import re
 import select
 import socket
 import termios
@@ -41,10 +43,9 @@ class LinkSpec:
 
 def parse_link(text: str) -> LinkSpec:
     """The address in a link's notation; ValueError names the error."""
-    if text.startswith("/dev/"):
-        text = "serial:" + text.replace(",", ":")
-    kind, _, rest = text.partition(":")
-    kind = "udpin" if kind == "udp" else kind
+    address = re.sub(r",(?=\d+$)", ":", text.replace("://", ":", 1))
+    kind, _, rest = (f"serial:{address}" if text.startswith("/dev/") else address).partition(":")
+    kind = {"udp": "udpin", "tcpout": "tcp"}.get(kind, kind)
     place, _, number = rest.rpartition(":")
     if kind not in PORTS:
         raise ValueError(f"link {text!r}: use one of {', '.join(PORTS)}, as udpin:0.0.0.0:14550")

@@ -70,6 +70,8 @@ def parse_source(source: str) -> tuple[str, str, dict[str, str]]:
         raise InputError("no camera source given; name a video, a folder of images or '-'")
     if source == "-":
         return "pipe", "-", {}
+    if source.startswith("/dev/video"):
+        source = f"v4l2:{source}"
     path = Path(source)
     if path.exists():
         return ("images" if path.is_dir() else "file"), source, {}

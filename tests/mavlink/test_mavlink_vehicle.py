@@ -75,9 +75,13 @@ def test_a_fault_in_the_service_does_not_cost_the_link(caplog: pytest.LogCapture
         ("serial:/dev/ttyTHS1:921600", LinkSpec("serial", "/dev/ttyTHS1", 921600)),
         ("serial:/dev/ttyACM0", LinkSpec("serial", "/dev/ttyACM0", 57600)),
         ("/dev/ttyACM0,115200", LinkSpec("serial", "/dev/ttyACM0", 115200)),
+        ("serial:/dev/ttyACM0,115200", LinkSpec("serial", "/dev/ttyACM0", 115200)),
+        ("serial:///dev/ttyACM0:115200", LinkSpec("serial", "/dev/ttyACM0", 115200)),
+        ("udpin://0.0.0.0:14540", LinkSpec("udpin", "0.0.0.0", 14540)),
+        ("tcpout://10.0.0.1:5760", LinkSpec("tcp", "10.0.0.1", 5760)),
     ],
 )
-def test_links_are_named_as_pymavlink_does(text: str, spec: LinkSpec) -> None:
+def test_links_are_named_as_pymavlink_and_mavsdk_do(text: str, spec: LinkSpec) -> None:
     assert parse_link(text) == spec
 
 

@@ -335,6 +335,7 @@ def test_header_without_images_is_refused(tmp_path: Path) -> None:
 
 def test_sources_are_parsed(tmp_path: Path) -> None:
     assert parse_source("-") == ("pipe", "-", {})
+    assert parse_source("/dev/video0?framerate=30")[:2] == ("v4l2", "/dev/video0")
     assert parse_source(str(tmp_path)) == ("images", str(tmp_path), {})
     assert parse_source("pipe:-?format=rawvideo&video_size=4x3") == (
         "pipe",

@@ -301,6 +301,10 @@ def test_config_command(tmp_path: Path) -> None:
     path.write_text("[compute]\nlabels = 48\n")
     merged = run_cli("config", "default", str(path)).stdout
     assert "labels = 48" in merged and len(merged) >= len(printed.stdout)
+    for wrong in ("mavlink.links=udp:14550", "camera.source=rstp://a/b", "compute.backend=cuda"):
+        checked = run_cli("config", "check", str(path), "--set", wrong)
+        assert (checked.returncode, checked.stdout) == (2, "")
+        assert wrong.partition("=")[2].partition(":")[0] in checked.stderr
     assert run_cli("config", "check").returncode == 2
     assert run_cli("config", "chekc", str(path)).returncode == 2
 
