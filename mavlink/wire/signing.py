@@ -34,11 +34,15 @@ def fingerprint(key: bytes) -> str:
 
 def read_key(path: Path) -> bytes:
     """The 32-byte key in a file (raw, or 64 hex digits) that only its owner may read."""
-    if not path.is_file():
-        raise ValueError(f"{path}: no such signing key file")
-    if path.stat().st_mode & 0o077:
-        raise ValueError(f"{path}: others may read the signing key; chmod 600 it")
-    raw = path.read_bytes()
+    try:
+        if not path.is_file():
+            raise ValueError(f"{path}: no such signing key file")
+        if path.stat().st_mode & 0o077:
+            raise ValueError(f"{path}: others may read the signing key; chmod 600 it")
+        raw = path.read_bytes()
+    except OSError as error:
+        reason = f"the signing key cannot be read ({error.strerror}); chown it to this user"
+        raise ValueError(f"{path}: {reason}") from error
     if len(raw) == KEY_LENGTH:
         return raw
     try:

@@ -299,17 +299,21 @@ def _worker(worker: dict[str, Any]) -> Finding:
 
 
 def check_certificate(config: Config) -> Iterator[Finding]:
-    from service.stream.keys import expiry_unix_s
+    from service.stream.keys import expiry_unix_s, member_name
 
-    path = config.datalink.tls_certificate
+    path, drone = config.datalink.tls_certificate, config.scan.drone_name
     if not path:
         return
     try:
         left_days = (expiry_unix_s(Path(path)) - time.time()) / 86_400
+        name = member_name(Path(path))
     except SkyreliefError as error:
         yield Finding("certificate", BAD if isinstance(error, InputError) else NOTE, str(error))
         return
-    if left_days < 0:
+    if name != drone:
+        text = f"{path} is of {name!r}, scan.drone is {drone!r}: the ground would refuse its data"
+        yield Finding("certificate", BAD, text)
+    elif left_days < 0:
         text = f"{path} expired {-left_days:.0f} days ago; make new keys with 'skyrelief keys'"
         yield Finding("certificate", BAD, text)
     else:
@@ -318,8 +322,17 @@ def check_certificate(config: Config) -> Iterator[Finding]:
 
 
 def _datalink(config: Config) -> Iterator[Finding]:
-    if not (config.datalink.connect or config.datalink.listen):
-        yield Finding("datalink", NOTE, "no endpoints: scans stay onboard")
+    from service.stream.link import sessions
+    from service.stream.naming import check_name
+
+    try:
+        if sessions(config.datalink):
+            check_name(config.scan.drone_name, "drone")
+        else:
+            yield Finding("datalink", NOTE, "no endpoints: scans stay onboard")
+    except InputError as error:
+        yield Finding("datalink", BAD, str(error))
+        return
     for endpoint in config.datalink.connect:
         host, _, port = endpoint.partition("/")[2].partition("?")[0].rpartition(":")
         try:

@@ -107,9 +107,7 @@ class DatalinkSender:
         self._open_session = opener
         self.silence_s = SILENCE_S
         self._drone = check_name(drone if store is None else store.header.drone, "drone")
-        self._connections = [_LinkSession(config) for config in _sessions(config)]
-        for connection in self._connections:
-            check_endpoints(connection.config)
+        self._connections = [_LinkSession(config) for config in sessions(config)]
         self._lock = threading.Lock()  # of the outbox
         self._outbox = Outbox(_rate(config.budget_kbit_s, config.share), time.monotonic())
         self._stores: list[tuple[ScanStore, Listener, bool]] = []  # True: closed with the sender
@@ -399,10 +397,10 @@ def _rate(budget_kbit_s: float, share: float) -> float:
     return budget_kbit_s * 1000 / 8 * share
 
 
-def _sessions(config: DatalinkConfig) -> list[SessionConfig]:
+def sessions(config: DatalinkConfig) -> list[SessionConfig]:
     """A client for each endpoint to connect to, and a router where others connect to us.
 
-    Raises InputError for encrypted endpoints to listen on.
+    Raises InputError for encrypted endpoints to listen on, and as :func:`check_endpoints`.
     """
     for endpoint in config.listen:
         if is_encrypted(endpoint):
@@ -417,6 +415,9 @@ def _sessions(config: DatalinkConfig) -> list[SessionConfig]:
         tls_key=config.tls_key,
         rate_bytes_s=_rate(config.budget_kbit_s, config.share),
     )
-    calls = [replace(shared, connect=(endpoint,)) for endpoint in config.connect]
-    called = [replace(shared, mode="router", listen=config.listen)] if config.listen else []
-    return calls + called
+    found = [replace(shared, connect=(endpoint,)) for endpoint in config.connect]
+    if config.listen:
+        found.append(replace(shared, mode="router", listen=config.listen))
+    for session in found:
+        check_endpoints(session)
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,8 +74,10 @@ def _check_files(endpoint: str, config: SessionConfig) -> None:
     ):
         if not path:
             raise InputError(f"endpoint {endpoint} needs a {what}; make one with 'skyrelief keys'")
-        if not Path(path).is_file():
+        if not os.path.isfile(path):
             raise InputError(f"{what} {path} does not exist; make one with 'skyrelief keys'")
+        if not os.access(path, os.R_OK):
+            raise InputError(f"{what} {path} is not this user's to read; chown it to the service's")
 
 
 def open_session(config: SessionConfig) -> zenoh.Session:

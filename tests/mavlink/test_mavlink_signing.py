@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,17 @@ def test_times_are_saved_within_a_second_of_a_crash(tmp_path: Path) -> None:
     until(lambda: kept.is_file() and str(NOW + 10) in kept.read_text())
     assert Memory(kept.parent, fingerprint(KEY)).signing_streams == {(3, 255, 190): NOW + 10}
     link.stop()
+
+
+def test_a_key_of_another_user_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    path = tmp_path / "key"
+    path.touch(0o600)
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(ValueError, match=r"key: the signing key cannot be read.*chown"):
+        read_key(path)
 
 
 def test_keys_must_be_private_and_whole(tmp_path: Path) -> None:

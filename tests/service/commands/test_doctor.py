@@ -87,6 +87,21 @@ def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     assert findings("mavlink.links=modem:1")["mavlink"][0] == BAD
 
 
+def test_a_datalink_that_the_service_refuses_is_bad(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "not encrypted" in findings("datalink.connect=tcp/192.0.2.1:7447")["datalink"][1]
+    local = "datalink.connect=tcp/127.0.0.1:1"
+    assert findings(local, "scan.drone=my drone")["datalink"][0] == BAD
+    keys = []
+    for name in ("ca", "certificate", "key"):
+        (tmp_path / name).touch()
+        keys.append(f"datalink.tls_{name}={tmp_path / name}")
+    monkeypatch.setattr("os.access", lambda path, mode: path != str(tmp_path / "key"))
+    verdict, text = findings("datalink.connect=tls/127.0.0.1:1", *keys)["datalink"]
+    assert verdict == BAD and f"private key {tmp_path / 'key'} is not this user's" in text
+
+
 def test_a_camera_that_listens_waits_for_a_sender(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.cameras.live.OPEN_S", 0.2)
     source = f"rtmp-listen:127.0.0.1:{free_port()}/live"

@@ -203,12 +203,12 @@ def test_a_clock_that_is_behind_does_not_keep_a_drone_out(tmp_path: Path) -> Non
 
 
 def test_doctor_tells_how_long_a_certificate_holds(tmp_path: Path) -> None:
-    def found(days: float, path: str = "certificate.pem") -> tuple[str, str]:
+    def found(days: float, path: str = "certificate.pem", drone: str = "red") -> tuple[str, str]:
         shutil.rmtree(tmp_path / "fleet", ignore_errors=True)
         now = time.time() + (days - 10.0) * 86400
         make_keys(tmp_path / "fleet", {"drone": ["red"]}, days=10, now=now)
         chosen = tmp_path / "fleet" / "drone" / "red" / path
-        config = load_config(None, [f"datalink.tls_certificate={chosen}"])
+        config = load_config(None, [f"datalink.tls_certificate={chosen}", f"scan.drone={drone}"])
         (finding,) = check_certificate(config)
         return finding.verdict, finding.text
 
@@ -216,6 +216,7 @@ def test_doctor_tells_how_long_a_certificate_holds(tmp_path: Path) -> None:
     assert found(5.5)[0] == NOTE
     assert found(-5.5)[0] == BAD and "expired" in found(-5.5)[1]
     assert found(90.0, "key.pem")[0] == BAD
+    assert found(90.0, drone="blue")[0] == BAD and "of 'red'" in found(90.0, drone="blue")[1]
     assert not list(check_certificate(load_config(None, [])))
 
 
