@@ -207,7 +207,7 @@ def erase(call: Call, host: Host) -> Handled:
     Param 1: storage (1, or 0 for all), param 2 = 1 erases, param 3 = 1 resets the count.
     """
     if call.param(1, 0.0) not in (0.0, 1.0) or call.param(2, 0.0) != 1.0:
-        return Answer(Result.DENIED, "erase refused: storage 1 and param 2 = 1 are needed")
+        return Answer(Result.DENIED, "erase refused: needs storage 1, param 2 = 1")
 
     def act() -> Handled:
         refusal = _unless_idle(host, "erase")

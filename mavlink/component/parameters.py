@@ -175,7 +175,9 @@ class Parameters:
         name = _text(message.param_id)
         if name not in self._table or message.param_type != REAL32:
             self._acknowledge(name, 0.0, ACK_UNSUPPORTED)
-            return Answer(Result.DENIED, f"no parameter {name}")
+            is_known = name in self._table
+            text = f"{name} refused: send it as REAL32" if is_known else f"no parameter {name}"
+            return Answer(Result.DENIED, text)
         raw: bytes = message._param_value_raw  # pymavlink drops its trailing zeros
         answer = self.change(name, struct.unpack("<f", raw.ljust(4, b"\0")[:4])[0])
         accepted = answer.result is Result.ACCEPTED

@@ -161,8 +161,8 @@ class ControlActions:
     def parameter_changed(self, name: str, value: float) -> Answer:
         try:
             self._scanning.configure(lambda config: with_parameter(config, name, value))
-        except InputError as error:
-            return Answer(Result.DENIED, str(error))
+        except InputError as error:  # "--set KEY=VALUE: why"
+            return Answer(Result.DENIED, f"{name} refused: {str(error).partition(': ')[2]}")
         return ACCEPTED
 
     # ---- on worker threads -------------------------------------------------------------------
@@ -201,7 +201,10 @@ class ControlActions:
 def _systemctl(verb: str) -> Answer:
     """Ask the init system to reboot or power off."""
     try:
-        subprocess.run(["systemctl", verb], check=True, capture_output=True, timeout=10)
+        done = subprocess.run(["systemctl", verb], capture_output=True, timeout=10, check=False)
     except (OSError, subprocess.SubprocessError) as error:
         return Answer(Result.FAILED, f"systemctl {verb}: {error}")
+    if done.returncode:
+        why = done.stderr.decode(errors="replace").strip() or f"exit code {done.returncode}"
+        return Answer(Result.FAILED, f"systemctl {verb}: {why}")
     return ACCEPTED

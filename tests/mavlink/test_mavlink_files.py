@@ -280,7 +280,9 @@ def test_settings_of_the_camera_are_the_same_parameters() -> None:
     ack = put(b"SR_BASELINE_M", 1e9)
     assert (ack.param_result, value_of(ack)) == (2, 2.5)
     assert put(b"NOT_THERE", 1.0).param_result == 1
-    assert put(b"SR_BASELINE_M", 1.0, kind=6).param_result == 1
+    whole = dialect.MAVLink_param_ext_set_message(1, 100, b"SR_BASELINE_M", bytes(128), 6)
+    (ack, text) = ends.say(whole)
+    assert (ack.param_result, text.text) == (1, "SR_BASELINE_M refused: send it as REAL32")
     assert ends.say(dialect.MAVLink_param_ext_request_list_message(1, 1)) == []
     assert ends.say(dialect.MAVLink_param_ext_request_list_message(2, 100)) == []
 

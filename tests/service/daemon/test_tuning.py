@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import threading
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ import pytest
 from loopback import until
 from onboard import FakeCamera, Onboard, real_scan
 
+from mavlink.component.control import Answer, Power, Result
 from mavlink.component.parameters import PARAMETERS
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
@@ -123,8 +125,22 @@ def test_nothing_is_written_where_nothing_was_tuned(tmp_path: Path) -> None:
 def test_what_the_key_refuses_is_refused_with_the_value_kept(operator: Operator) -> None:
     assert operator.set("SR_RESOLUTION_M", 0.001) == 0.0
     assert operator.config.scan.resolution_m == 0.0
+    answer = operator.daemon.actions.parameter_changed("SR_RESOLUTION_M", 0.001)
+    assert answer.text.startswith("SR_RESOLUTION_M refused: scan.resolution_m = 0.001 is outside")
     with pytest.raises(InputError, match="resolution_m"):
         with_parameter(operator.config, "SR_RESOLUTION_M", 0.001)
+
+
+def test_a_refused_reboot_says_what_the_system_says(
+    operator: Operator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "systemctl"
+    program.write_text("#!/bin/sh\necho 'Interactive authentication required.' >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    answer = operator.daemon.actions.power(Power.REBOOT)
+    assert isinstance(answer, Answer) and answer.result is Result.FAILED
+    assert answer.text == "systemctl reboot: Interactive authentication required."
 
 
 def test_parameters_begin_as_the_file_says_and_follow_it(tmp_path: Path) -> None:
