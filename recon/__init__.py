@@ -30,9 +30,11 @@ __all__ = [
 _ROOMS = ("recon.types", "recon.pipeline.interface", "recon.pipeline.mapper")
 
 
-def __getattr__(name: str) -> Any:
-    if name in __all__:
-        for room in map(import_module, _ROOMS):
-            if hasattr(room, name):
-                return getattr(room, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # a type checker refuses names that are not there
+
+    def __getattr__(name: str) -> Any:
+        if name in __all__:
+            for room in map(import_module, _ROOMS):
+                if hasattr(room, name):
+                    return getattr(room, name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

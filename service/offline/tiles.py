@@ -7,6 +7,7 @@ memory follows the tile and not the site.
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -191,7 +192,7 @@ def _on_cluster(
         from distributed import Client
     try:
         client = Client(scheduler, timeout=connect_s, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
+    except (OSError, asyncio.TimeoutError, ValueError) as error:  # no OSError in Python 3.10
         raise OutsideError(
             f"no Dask scheduler answers at {scheduler} ({type(error).__name__}); start one with "
             "'dask scheduler', or leave out --scheduler"
@@ -209,7 +210,7 @@ def _on_cluster(
             if future.status != "finished":
                 raise ConnectionError(future.status)
             yield future.result(timeout=60.0)
-    except (OSError, TimeoutError) as error:
+    except (OSError, asyncio.TimeoutError) as error:
         progress(f"the cluster at {scheduler} disconnected ({error}); the rest is made here")
     finally:
         client.close(timeout=2.0)

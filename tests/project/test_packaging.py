@@ -72,6 +72,7 @@ def test_wheel_holds_the_packages_and_nothing_else(tmp_path: Path) -> None:
     )
     (wheel,) = tmp_path.glob("skyrelief-*.whl")
     names = zipfile.ZipFile(wheel).namelist()
+    assert "recon/py.typed" in names  # a program that uses the library is checked against its types
     tops = {name.split("/")[0] for name in names}
     info = f"skyrelief-{version('skyrelief')}"
     assert tops <= {*PACKAGES, f"{info}.dist-info", f"{info}.data"}
