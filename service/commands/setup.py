@@ -63,7 +63,7 @@ def _check_names(chosen: Config, where: str) -> None:
             parse_source(chosen.camera.source)
     except (InputError, ValueError) as error:
         raise InputError(f"{where}: {error}") from error
-    one_of(chosen.compute.backend, ("auto", *BACKENDS), f"{where}: compute.backend")
+    one_of(chosen.compute.backend, ("auto", *BACKENDS, "onnx"), f"{where}: compute.backend")
 
 
 def to_toml(values: Mapping[str, Mapping[str, Any]], documented: bool = False) -> str:

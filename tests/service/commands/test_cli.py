@@ -295,7 +295,8 @@ def test_config_command(tmp_path: Path) -> None:
     printed = run_cli("config", "default")
     assert printed.returncode == 0
     path.write_text(printed.stdout)
-    assert "good" in run_cli("config", "check", str(path)).stdout
+    onnx = "compute.backend=onnx"
+    assert "good" in run_cli("config", "check", str(path), "--set", onnx).stdout
     shown = run_cli("config", "show", str(path), "--set", "compute.labels=24", "--json")
     assert json.loads(shown.stdout.splitlines()[-1])["compute"]["labels"] == 24
     path.write_text("[compute]\nlabels = 48\n")
