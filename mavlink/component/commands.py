@@ -185,6 +185,11 @@ def digicam(call: Call, host: Host) -> Handled:
     return host.camera.shoot() if call.param(5, 0.0) == 1.0 else Answer(Result.UNSUPPORTED)
 
 
+def set_mode(call: Call, host: Host) -> Handled:
+    """SET_CAMERA_MODE by param 2: always video (1), in which photos are taken, too."""
+    return ACCEPTED if call.param(2, -1.0) == 1.0 else Answer(Result.DENIED)
+
+
 # The computer and its storage.
 
 
@@ -299,6 +304,7 @@ COMMANDS: dict[int, Command] = {
     246: Command(_ONBOARD, 3.0, reboot),
     526: Command(_CAMERA, 3.0, erase),
     529: Command(_CAMERA, 3.0, reset_settings),
+    530: Command(_CAMERA, 3.0, set_mode),
     512: Command(_CAMERA | _ONBOARD, 0.0, request_message),
     **{number: Command(_CAMERA, 0.0, request_camera) for number in CAMERA_MESSAGES},
     511: Command(_CAMERA | _ONBOARD, 0.0, message_interval),

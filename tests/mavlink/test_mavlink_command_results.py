@@ -258,6 +258,7 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
         ],
         CANCELLED: [worked("finalise", "cancelled", 31010, ONBOARD, 5)],
     },
+    530: {ACCEPTED: [plain(530, CAMERA, 0, 1)], DENIED: [plain(530, CAMERA, 0, 0)]},
     246: {
         ACCEPTED: [disarmed(plain(246, ONBOARD, 0, k)) for k in (1, 2)]
         + [disarmed(plain(246, ONBOARD, 0, 0, 1, 191))],

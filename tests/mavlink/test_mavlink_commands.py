@@ -789,7 +789,7 @@ def test_unknown_commands_are_refused_at_once_and_only_by_the_one_asked(ends: En
         assert ends.command(400, component, 1) == [UNSUPPORTED]
         assert ends.command(65535, component) == [UNSUPPORTED]
     assert ends.command(400, 0, 1) == []
-    assert ends.command(530, 0, 0, 1) == []
+    assert ends.command(531, 0, 0, 1) == []
 
 
 def test_commands_to_others_are_left_alone(ends: Ends) -> None:

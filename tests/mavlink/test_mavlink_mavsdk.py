@@ -89,10 +89,11 @@ def test_mavsdk_finds_components_and_the_camera(
 
 def test_mavsdk_records_and_takes_photos(joined: Joined) -> None:
     daemon, ground, system = joined
-    from mavsdk.plugins.camera.camera import Camera, CameraError
+    from mavsdk.plugins.camera.camera import Camera, CameraError, Mode
 
     camera = ground.use(Camera(system))
     until(lambda: camera.camera_list().cameras)
+    camera.set_mode(100, Mode.VIDEO)
     captures: list[Any] = []
     camera.subscribe_capture_info(lambda info, _: captures.append(info))
     camera.start_video(100)
