@@ -31,6 +31,9 @@ MAX_SCALE, MIN_SCALE = 2.0, 1 / 64
 BAND_ROWS = 512
 """Rows of the atlas whose borders are made at a time."""
 
+HEIGHT_STEP = 1.25
+"""Charts whose heights differ by no more than this factor may share a shelf."""
+
 CELL_PX = 4
 """Side of the square that holds a triangle which no view sees."""
 
@@ -50,19 +53,25 @@ def lay_out(
 ) -> Layout:
     """The atlas of triangles labelled with their view (-1: none), no side above ``largest_px``.
 
-    A chart is a connected piece of one label, as the view sees it. Charts are packed in shelves by
-    height; when they do not fit, all are scaled down, to MIN_SCALE at least: their borders and
-    triangles without a view keep their size, and may need a larger atlas.
+    The mesh needs ``rgb``. A chart is a connected piece of one label, as the view sees it. Charts
+    are packed in shelves by height, those of like brightness next to each other; when they do not
+    fit, all are scaled down, to MIN_SCALE at least: their borders and triangles without a view keep
+    their size, and may need a larger atlas.
     """
+    assert mesh.rgb is not None
     chart = _charts(label, neighbours)
     uv = _seen_uv(mesh, views, label)
+    brightness = mesh.rgb[mesh.faces].mean(axis=(1, 2))
     lone = np.flatnonzero(label < 0)
+    lone = lone[np.argsort(brightness[lone], kind="stable")]
     scale = _scale_for(uv[label >= 0])
+    count = np.bincount(chart[chart >= 0])
+    of_chart = np.append(np.bincount(chart[chart >= 0], brightness[chart >= 0]) / count, 0.0)
     while True:
         low, size = _boxes(uv * scale, chart)
         columns = max(1, int(np.sqrt(len(lone))))
         block = np.array([[columns, -(-len(lone) // columns)]], np.int64) * CELL_PX
-        place, (w, h) = pack(np.concatenate([size, block]))
+        place, (w, h) = pack(np.concatenate([size, block]), of_chart)
         if max(w, h) <= largest_px or scale < MIN_SCALE:
             break
         scale *= 0.98 * largest_px / max(w, h)
@@ -127,13 +136,19 @@ def _boxes(uv: F64, chart: I32) -> tuple[F64, I64]:
     return low, (np.ceil(high) - low).astype(np.int64) + 2 * BORDER_PX
 
 
-def pack(size: I64) -> tuple[F64, tuple[int, int]]:
-    """Upper left corners (C, 2) of (C, 2) rectangles in shelves, and the (w, h) of the whole."""
+def pack(size: I64, brightness: F64) -> tuple[F64, tuple[int, int]]:
+    """Upper left corners (C, 2) of (C, 2) rectangles in shelves, and the (w, h) of the whole.
+
+    Of about one height, those of like ``brightness`` (C,) lie together: from far away a viewer
+    takes a texel of a coarse mip level, the mean of several small charts.
+    """
     area = float((size[:, 0] * size[:, 1]).sum())
     width = int(max(np.ceil(np.sqrt(1.1 * area)), size[:, 0].max(initial=1)))
     place = np.zeros((len(size), 2))
     x = y = shelf = 0
-    for n in np.argsort(-size[:, 1], kind="stable"):
+    height = np.ceil(np.log(np.maximum(size[:, 1], 1)) / np.log(HEIGHT_STEP))
+    up_and_down = np.where(height % 2 == 0, brightness, -brightness)  # no jump between heights
+    for n in np.lexsort((up_and_down, -height)):
         w, h = int(size[n, 0]), int(size[n, 1])
         if x + w > width:
             x, y, shelf = 0, y + shelf, 0
@@ -195,7 +210,7 @@ def flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
 
 
 def bordered(image: U8, done: Bool) -> U8:
-    """The charts' colours carried a few texels past their edges."""
+    """The charts' colours carried past their edges, until no texel is without one."""
     out, reach = np.empty_like(image), BORDER_PX + 1
     for top in range(0, len(image), BAND_ROWS):  # in single precision an atlas takes a gigabyte
         first, end = max(top - reach, 0), top + BAND_ROWS
@@ -205,6 +220,8 @@ def bordered(image: U8, done: Bool) -> U8:
 
 
 def _carried(image: U8, done: Bool, steps: int) -> U8:
+    """Near a chart the mean of what is next to it; farther off that of ever larger squares: a
+    black gap would darken the coarse mip levels."""
     reached = done.copy()
     out = image.astype(np.float32)
     for _ in range(steps):
@@ -214,7 +231,27 @@ def _carried(image: U8, done: Bool, steps: int) -> U8:
         sums = cv2.boxFilter(out * weight[..., None], -1, (3, 3), normalize=False)
         out[new] = sums[new] / total[new, None]
         reached |= new
+    _fill_gaps(out, reached)
     return np.clip(np.rint(out), 0, 255).astype(np.uint8)
+
+
+def _fill_gaps(colour: F32, known: Bool) -> None:
+    """Give each texel of ``colour`` (h, w, 3) that is not ``known`` the mean of the known ones in
+    the smallest square of a pyramid of halves that holds some."""
+    h, w = known.shape
+    if known.all() or not known.any():
+        return
+    half = (-(-w // 2), -(-h // 2))
+    padded = cv2.copyMakeBorder(
+        np.dstack([colour * known[..., None], known.astype(np.float32)]),
+        0, 2 * half[1] - h, 0, 2 * half[0] - w, cv2.BORDER_CONSTANT, value=0,
+    )  # fmt: skip
+    mean = cv2.resize(padded, half, interpolation=cv2.INTER_AREA)
+    seen = mean[..., 3] > 0
+    coarse = mean[..., :3] / np.maximum(mean[..., 3:], 1e-9)
+    _fill_gaps(coarse, seen)
+    row, column = np.nonzero(~known)
+    colour[row, column] = coarse[row // 2, column // 2]
 
 
 @njit(cache=True, nogil=True)

@@ -63,10 +63,10 @@ def texture(
     gains = levels(found, len(views))
     fade_view, fade_share = fading(mesh.faces, label, len(mesh.vertices_m), len(views))
     progress("packing the atlas")
-    layout = lay_out(mesh, views, label, neighbours, largest_px)
-    progress("painting {} x {} texels".format(*layout.size_px))
     mesh = replace(mesh, rgb=spread_colours(mesh.faces, mesh.rgb, found, slot, gains))
     assert mesh.rgb is not None
+    layout = lay_out(mesh, views, label, neighbours, largest_px)
+    progress("painting {} x {} texels".format(*layout.size_px))
     palette = Palette(views, gains, fade_view, fade_share, mesh.rgb)
     image = paint(mesh, layout, found, label, neighbours, palette)
     used = np.unique(label[label >= 0])
