@@ -212,6 +212,15 @@ def placed(cloud: PointCloud, frame: LocalFrame | None) -> F64:
     return enu if frame is None or not len(enu) else frame.to_utm(enu)
 
 
+def las_wkt(epsg: int, vertical: str | None) -> str:
+    """What :func:`service.georeference.map_crs` gives, as LAS 1.4 asks for it: in WKT 1.
+
+    Only ellipsoidal heights are in WKT 2, as WKT 1 has none on a map.
+    """
+    version = "WKT2_2019" if vertical == "ellipsoid" else "WKT1_GDAL"
+    return map_crs(epsg, vertical).to_wkt(version)
+
+
 def las_header(
     xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int, vertical: str | None = None
 ) -> laspy.LasHeader:
@@ -238,7 +247,7 @@ def las_header(
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True  # LAS 1.4 requires it with this format, even without a CRS
     if frame is not None:
-        header.add_crs(map_crs(frame.epsg, vertical))
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(las_wkt(frame.epsg, vertical)))
     return header
 
 

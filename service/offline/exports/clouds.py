@@ -17,11 +17,10 @@ import numpy as np
 
 from recon.mapping.cloud_fusion import without
 from recon.types import F64, I64, U8, Array, PointCloud
-from service.georeference import map_crs
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
-from service.scans.fused_cloud import CHUNK_POINTS, SCALE_M, Box, write_laz
+from service.scans.fused_cloud import CHUNK_POINTS, SCALE_M, Box, las_wkt, write_laz
 from service.scans.writing import writing, writing_folder
 
 if TYPE_CHECKING:
@@ -179,10 +178,7 @@ def _config(
     # Extra dimensions: copclib can read their description but not build it.
     extra = copclib.LazReader(str(las)).laz_config.extra_bytes_vlr
     vector = copclib.Vector3
-    wkt = ""
-    if scan.frame is not None:  # WKT1 knows no ellipsoidal heights of a map
-        version = "WKT2_2019" if vertical == "ellipsoid" else "WKT1_GDAL"
-        wkt = map_crs(scan.frame.epsg, vertical).to_wkt(version)
+    wkt = "" if scan.frame is None else las_wkt(scan.frame.epsg, vertical)
     config = copclib.CopcConfigWriter(
         7, vector([SCALE_M] * 3), vector(list(map(float, header.offsets))), wkt, extra, False
     )

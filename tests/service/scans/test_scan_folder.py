@@ -68,6 +68,8 @@ def test_cloud_is_where_the_house_stands(tmp_path: Path, house: HouseFlight) -> 
     assert cloud.header.point_format.id == 7
     assert cloud.header.are_points_compressed
     assert cloud.header.parse_crs().to_epsg() == 32632 == summary["epsg"]
+    (record,) = [one for one in cloud.header.vlrs if one.record_id == 2112]
+    assert record.string.startswith("PROJCS[")  # WKT 1, as LAS 1.4 asks for it
     assert cloud.header.creation_date.isoformat() == "2023-11-14"
     enu = enu_of(cloud, house)
     np.testing.assert_allclose(enu[:, 2], house.roof_m(enu[:, 0], enu[:, 1]), atol=6.01)
