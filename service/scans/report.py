@@ -20,6 +20,7 @@ import numpy as np
 from recon.camera_model import rays
 from recon.surface.raster import Raster
 from recon.types import F64, U8, PointCloud
+from service.georeference import map_crs
 from service.scans.coverage import Coverage
 from service.scans.drawing import Maps, draw_maps
 from service.scans.report_appendix import appendix
@@ -237,7 +238,8 @@ def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[s
         rows.append(("position", "no georeference: metres about the scan's own origin"))
     else:
         rows.append(("origin", f"{origin['lat_deg']:.7f}, {origin['lon_deg']:.7f}"))
-        rows.append(("coordinates", f"EPSG:{summary['epsg']}, {summary['heights']}"))
+        epsg = summary["epsg"]
+        rows.append(("coordinates", f"{map_crs(epsg).name} (EPSG:{epsg}), {summary['heights']}"))
     rows.append(("finished", "yes" if summary["finished"] else "no, still growing or cut off"))
     return rows
 

@@ -41,8 +41,9 @@ from service.scans.track import heights_above
 from service.scans.writing import writing
 
 NODATA_M = -9999.0
-QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
-"""Half the time of GDAL's defaults for 3 % larger files; the mean of heights never overshoots."""
+COG = {"level": 4, "overview_resampling": "AVERAGE", "statistics": "YES"}
+"""Half the time of GDAL's defaults for 3 % larger files; the mean of heights never overshoots. GIS
+stretch colours by the statistics, which they else take from the overviews or not at all."""
 
 RAW = {"tiled": True, "sparse_ok": True, "bigtiff": "IF_SAFER"}
 GDAL_CACHE_BYTES = 128_000_000
@@ -230,13 +231,14 @@ def mosaic(scan: ScanView, out: Path, grid: Grid, like: Layers) -> Iterator[Any]
         raw = Path(folder) / "raw.tif"
         with rasterio.open(raw, "w+", **profile, **RAW) as image:
             image.descriptions = like.names
+            image.units = ["metre" if name.endswith(", m") else "" for name in like.names]
             image.update_tags(SCAN=scan.store.header.scan_id, HEIGHTS=heights)
             if like.bands.dtype == np.uint8:
                 kinds = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
                 image.colorinterp = kinds
             yield image
         predictor = "YES" if like.bands.dtype.kind == "f" else "STANDARD"
-        how = {"driver": "COG", "compress": "DEFLATE", "predictor": predictor} | QUICKLY
+        how = {"driver": "COG", "compress": "DEFLATE", "predictor": predictor} | COG
         copy(str(raw), str(part), **how, num_threads=threads())
 
 

@@ -219,6 +219,9 @@ def test_dsm_says_what_is_filled(scan_dir: Path, tmp_path: Path) -> None:
         path = written(scan_dir, "dsm", ExportOptions(cell_m=0.2, strict=strict))
         with rasterio.open(path) as image:
             assert image.descriptions[2] == "filled"
+            assert image.units == ("metre", "metre", None, "metre")
+            heights = image.read(1, masked=True)
+            assert float(image.tags(1)["STATISTICS_MAXIMUM"]) == pytest.approx(heights.max())
             assert "alpha" not in [kind.name for kind in image.colorinterp]
             bands.append(image.read())
     strict_m, (height, sigma, origin, absolute) = bands[0][0], bands[1]

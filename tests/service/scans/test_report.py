@@ -156,6 +156,7 @@ def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -
     assert all(p.agl_m is None for p in poses)
     rows = dict(re.findall(r"<tr><td>([^<]+)</td><td>([^<]+)", page))
     assert float(rows["height above ground, median"].removesuffix(" m")) == pytest.approx(40, abs=1)
+    assert rows["coordinates"].startswith("WGS 84 / UTM zone 32N (EPSG:32632), metres above")
 
 
 def test_figures_of_a_graph_are_its_own() -> None:
