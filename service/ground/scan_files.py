@@ -40,8 +40,8 @@ TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
 """Names that py3dtiles gives its files; all are in one folder."""
 
 DEEPEST_TILE = 8
-MAPS_KIND = "all"
-MAPS = EXPORTERS[MAPS_KIND][1]
+MAPS = EXPORTERS["all"][1]
+FOLDERS = {name for _, name, _ in EXPORTERS.values() if "." not in name}
 ZIP_PART_BYTES = 1 << 20
 SEQ = re.compile(r"[0-9]{1,9}")
 
@@ -57,7 +57,7 @@ SANDBOX = {
 def file_routes(one: str) -> list[Route]:
     return [
         Route(one + "/files/{name}", _file),
-        Route(one + "/maps.zip", _maps),
+        Route(one + "/{folder}.zip", _zipped),
         Route(one + "/tiles/{name:path}", _tile),
         Route(one + "/keyframes/{seq}.jpg", _image),
         Route(one + "/coverage.png", _coverage),
@@ -77,12 +77,14 @@ def _file(request: Request) -> Response:
     return FileResponse(path, filename=f"{request.path_params['scan']}-{path.name}")
 
 
-def _maps(request: Request) -> Response:
-    """All maps in one zip, as the deliverable ``all`` has left them."""
-    folder = folder_of(request) / MAPS
-    if not is_regular(folder / MANIFEST):
-        raise MissingError(f"no maps yet; make {MAPS_KIND!r} first")
-    name = f"{request.path_params['scan']}-maps.zip"
+def _zipped(request: Request) -> Response:
+    """A product that is a folder, in one zip: maps, mesh-obj, colmap, 3dtiles or 3dtiles-mesh."""
+    name = request.path_params["folder"]
+    folder = folder_of(request) / name
+    is_there = name in FOLDERS and folder.is_dir() and not folder.is_symlink()
+    if not is_there or (name == MAPS and not is_regular(folder / MANIFEST)):  # written last
+        raise MissingError(f"no {name} yet; make it first")
+    name = f"{request.path_params['scan']}-{name}.zip"
     headers = {"content-disposition": f'attachment; filename="{name}"'}  # FileResponse's alone
     return StreamingResponse(zip_parts(folder), media_type="application/zip", headers=headers)
 
@@ -106,11 +108,11 @@ class _Pipe(list[bytes]):
 
 
 def zip_parts(folder: Path) -> Iterator[bytes]:
-    """The regular files of a folder as a zip, made while it is read."""
+    """The regular files of a folder, and of those in it, as a zip, made while it is read."""
     pipe = _Pipe()
     with zipfile.ZipFile(cast(IO[bytes], pipe), "w") as whole:
-        for path in sorted(p for p in folder.iterdir() if is_regular(p)):
-            about = zipfile.ZipInfo.from_file(path, path.name)
+        for path in sorted(p for p in folder.rglob("*") if is_regular(p)):
+            about = zipfile.ZipInfo.from_file(path, path.relative_to(folder))
             with whole.open(about, "w", force_zip64=True) as out, open(path, "rb") as file:
                 while data := file.read(ZIP_PART_BYTES):
                     out.write(data)

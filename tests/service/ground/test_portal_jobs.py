@@ -150,6 +150,41 @@ def test_all_maps_come_in_one_zip(portal: Portal, tmp_path: Path) -> None:
         assert {name: found.read(name) for name in found.namelist()} == files
 
 
+def test_products_that_are_folders_come_as_a_zip(portal: Portal, tmp_path: Path) -> None:
+    client, scan = Client(portal), tmp_path / "drone-1/test-1"
+    assert client.ask(ONE + "/colmap.zip")[0] == 404
+    files = {"images/keyframe_000001.jpg": b"x", "sparse/0/cameras.txt": b"1 PINHOLE"}
+    for name, data in files.items():
+        path = scan / "colmap" / name
+        path.parent.mkdir(parents=True)
+        path.write_bytes(data)
+    (scan / "colmap/elsewhere").symlink_to(tmp_path)  # left out
+    status, data, headers = client.ask(ONE + "/colmap.zip")
+    assert status == 200 and "test-1-colmap.zip" in headers["content-disposition"]
+    with zipfile.ZipFile(io.BytesIO(data)) as found:
+        assert {name: found.read(name) for name in found.namelist()} == files
+    (scan / "mesh-obj").symlink_to(scan / "colmap")
+    (scan / "tokens").mkdir()
+    assert [client.ask(f"{ONE}/{name}.zip")[0] for name in ("mesh-obj", "tokens")] == [404, 404]
+
+
+@pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
+def test_a_folder_is_downloaded_from_the_page(
+    browser: Browser, portal: Portal, tmp_path: Path, needs: None
+) -> None:
+    made = tmp_path / "drone-1/test-1/mesh-obj"
+    made.mkdir()
+    (made / "mesh.obj").write_bytes(b"v 0 0 0")
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.click("Export…")
+    browser.wait("document.querySelectorAll('.product').length > 20")
+    with browser.page.expect_download() as download:
+        browser.page.click("[aria-label='Download Mesh, OBJ']")
+    with zipfile.ZipFile(download.value.path()) as found:
+        assert found.namelist() == ["mesh.obj"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
 def test_all_maps_are_two_clicks_away(

@@ -294,6 +294,9 @@ export const mapThumbnail = (s: { drone: string; scan: string }): string =>
 
 export const file = (s: { drone: string; scan: string }, name: string): string =>
   `${place(s)}/files/${encodeURIComponent(name)}`;
+/** The address of a product; a folder comes as a zip. */
+export const product = (s: { drone: string; scan: string }, name: string): string =>
+  name.includes(".") ? file(s, name) : `${place(s)}/${name}.zip`;
 
 export function liveAddress(s: { drone: string; scan: string }): string {
   const scheme = location.protocol === "https:" ? "wss:" : "ws:";

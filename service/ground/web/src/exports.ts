@@ -76,14 +76,14 @@ function rowOf(s: api.Scan, p: api.Product, heights: () => api.Heights, again: (
       .catch(notify)
       .finally(again);
   };
-  const get = el("a", { className: "button", textContent: "Download", href: addressOf(s, p) ?? "", download: "" });
+  const get = el("a", { className: "button", textContent: "Download", href: api.product(s, p.file), download: "" });
   get.setAttribute("aria-label", `Download ${p.title}`);
   const figures = p.impossible ?? (p.bytes === null ? about(p) : [size(p.bytes), p.file].join(" · "));
   return el(
     "div",
     { className: "product" },
     el("div", {}, el("strong", { textContent: p.title }), el("p", { textContent: p.text }), el("p", { className: "quiet", textContent: figures })),
-    el("span", { className: "acts" }, p.bytes !== null && addressOf(s, p) ? get : null, act),
+    el("span", { className: "acts" }, p.bytes === null ? null : get, act),
     el("ul", { className: "jobs made" }),
   );
 }
@@ -91,9 +91,3 @@ function rowOf(s: api.Scan, p: api.Product, heights: () => api.Heights, again: (
 /** The size and time that a product will take. */
 const about = ({ about_bytes, about_s }: api.Product): string =>
   [about_bytes === null ? "" : `about ${size(about_bytes)}`, about_s === null ? "" : `about ${duration(about_s)}`].filter(Boolean).join(", ");
-
-/** The address of a product; null for folders, which are no download. */
-function addressOf(s: api.Scan, p: api.Product): string | null {
-  if (p.kind === "all") return `${api.scanAddress(s)}/maps.zip`;
-  return p.file.includes(".") ? api.file(s, p.file) : null;
-}

@@ -81,11 +81,9 @@ function row(job: api.Job, name: string): Row {
   return { element, show };
 }
 
-/** The address of what a job has made; null for folders, which are no download. */
+/** The address of what a job has made; null for a scan, which is a card. */
 function madeAt(job: api.Job): string | null {
-  if (job.kind === "all") return `${api.scanAddress(job)}/maps.zip`;
-  if (job.kind === "scan") return null; // it is the card
-  return job.file?.includes(".") ? api.file(job, job.file) : null;
+  return job.file === null || job.kind === "scan" || job.kind === "align" ? null : api.product(job, job.file);
 }
 
 function wordsOf(job: api.Job): string {
