@@ -20,10 +20,11 @@ def check_camera(camera: Camera) -> None:
     W, H = camera.size_px
     if W < 16 or H < 16:
         raise ValueError(f"image size {W}x{H} is too small")
-    if camera.K.shape != (3, 3) or camera.distortion.shape != (5,):
-        raise ValueError(
-            f"K must be (3, 3) and distortion (5,), got {camera.K.shape}, {camera.distortion.shape}"
-        )
+    K, distortion = camera.K, camera.distortion
+    if not isinstance(K, np.ndarray) or not isinstance(distortion, np.ndarray):
+        raise ValueError("K and distortion must be arrays of NumPy")
+    if K.shape != (3, 3) or distortion.shape != (5,):
+        raise ValueError(f"K must be (3, 3) and distortion (5,), got {K.shape}, {distortion.shape}")
     if not np.isfinite(camera.K).all() or not np.isfinite(camera.distortion).all():
         raise ValueError("K and distortion must be finite numbers")
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]

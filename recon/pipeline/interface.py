@@ -6,8 +6,10 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from recon.tracking.frame import Frame
-from recon.types import Array, Keyframe, Pose
+from recon.types import U8, Array, Keyframe, Pose, PosePrior
 
 Timing = Callable[[str], AbstractContextManager[object]]
 """Gives a stage by name the context that it runs in."""
@@ -78,3 +80,32 @@ class PosesChanged:
 
 
 Event = FramePosed | KeyframeReady | PosesChanged
+
+
+def check_image(image: U8, size_px: tuple[int, int]) -> None:
+    """Raise ValueError, naming the fault, unless the image is (H, W, 3) uint8 of ``size_px``."""
+    wanted = (size_px[1], size_px[0], 3)
+    if not isinstance(image, np.ndarray) or image.shape != wanted or image.dtype != np.uint8:
+        given = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else repr(image)
+        raise ValueError(f"the image must be BGR, {wanted} uint8 by the camera model, not {given}")
+
+
+def check_prior(prior: PosePrior) -> None:
+    """Raise ValueError, naming the field, where a part of the prior is none that can be."""
+    if not isinstance(prior, PosePrior):
+        raise ValueError(f"the prior must be a PosePrior, not {prior!r}; leave it out for none")
+    R = prior.R_world_camera
+    if R is not None and not (
+        _is_finite(R, (3, 3))
+        and np.allclose(R @ R.T, np.eye(3), atol=1e-3)
+        and np.linalg.det(R) > 0.0
+    ):
+        raise ValueError(f"R_world_camera must be a (3, 3) rotation, or None, not {R!r}")
+    for name in ("position_m", "sigma_position_m", "velocity_m_s", "turn_rad_s"):
+        value = getattr(prior, name)
+        if value is not None and not _is_finite(value, (3,)):
+            raise ValueError(f"{name} must be an array of 3 numbers, or None, not {value!r}")
+
+
+def _is_finite(value: object, shape: tuple[int, ...]) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == shape and bool(np.isfinite(value).all())

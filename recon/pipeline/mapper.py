@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
+
 from recon.backends import Backend, DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
@@ -25,6 +27,8 @@ from recon.pipeline.interface import (
     MapperConfig,
     PosesChanged,
     Timing,
+    check_image,
+    check_prior,
     untimed,
 )
 from recon.pipeline.keyframe_map import KeyframeMap
@@ -122,6 +126,7 @@ class Mapper:
         self.rejected = Counter[str]()  # pairs and keyframes; written while reconstructing
         self.debug: dict[str, Array] | None = {} if config.keeps_debug else None
         self._timing = timing
+        self._size_px, self._last = camera.size_px, (-1, -(1 << 63))  # number and time of a frame
         self.undistort = Undistort(camera, config.guide_width_px, timing)
         self.odometry = known or Odometry(
             self.undistort.tracking_camera,
@@ -166,8 +171,21 @@ class Mapper:
     def add(self, frame: Frame) -> tuple[Event, ...]:
         """One frame of a recording; those that hardly moved are not looked at.
 
-        Raises ValueError when the image is not of the camera model's size.
+        Raises ValueError for an image that is not (H, W, 3) uint8 of the camera model's size, a
+        number or time that is not after the last frame's, or a prior with no rotation or position.
         """
+        check_image(frame.image, self._size_px)
+        check_prior(frame.prior)
+        if not isinstance(frame.time_ns, int | np.integer):
+            raise ValueError(
+                f"frame {frame.seq}: time_ns {frame.time_ns!r} is no whole number of ns"
+            )
+        seq, time_ns = self._last
+        if frame.seq <= seq or frame.time_ns <= time_ns:
+            raise ValueError(
+                f"frame {frame.seq} at {frame.time_ns} ns is not after frame {seq} at {time_ns} ns"
+            )
+        self._last = frame.seq, int(frame.time_ns)
         return self.skip(frame.seq, frame.time_ns, frame.prior) or self.track(frame)
 
     def skip(self, seq: int, time_ns: int, prior: PosePrior) -> tuple[Event, ...]:

@@ -72,6 +72,42 @@ def test_a_mapper_without_its_keyframes_has_no_cloud() -> None:
     assert mapper.finish() == () and len(Mapper(CAMERA).finish()) == 0
 
 
+IMAGE = np.zeros((60, 80, 3), np.uint8)
+LOOKS_DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("frame", "fault"),
+    [
+        (Frame(IMAGE[:, :, 0], 9, 9), r"\(60, 80, 3\) uint8 by the camera model, not \(60, 80\) "),
+        (Frame(IMAGE.astype(np.float32), 9, 9), "not .* float32"),  # type: ignore[arg-type]
+        (Frame(np.zeros((80, 60, 3), np.uint8), 9, 9), r"not \(80, 60, 3\)"),
+        (Frame(np.zeros((120, 160, 3), np.uint8), 9, 9), r"not \(120, 160, 3\)"),
+        (Frame(None, 9, 9), "not None"),  # type: ignore[arg-type]
+        (Frame(IMAGE, 9, 0), "frame 0 at 9 ns is not after frame 0 at 5 ns"),
+        (Frame(IMAGE, 5, 9), "frame 9 at 5 ns is not after"),
+        (Frame(IMAGE, 0.5, 9), "no whole number of ns"),  # type: ignore[arg-type]
+        (Frame(IMAGE, 9, 9, None), "must be a PosePrior"),  # type: ignore[arg-type]
+        (Frame(IMAGE, 9, 9, PosePrior(2.0 * LOOKS_DOWN)), "R_world_camera must be"),
+        (Frame(IMAGE, 9, 9, PosePrior(-LOOKS_DOWN)), "R_world_camera must be"),
+        (Frame(IMAGE, 9, 9, PosePrior(np.array([1.0, 0, 0, 0]))), "R_world_camera must be"),
+        (Frame(IMAGE, 9, 9, PosePrior(position_m=np.full(3, np.nan))), "position_m must be"),
+        (Frame(IMAGE, 9, 9, PosePrior(position_m=[1, 2, 3])), "array"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_frame_that_cannot_be_used_is_refused_by_name(frame: Frame, fault: str) -> None:
+    mapper = Mapper(CAMERA)
+    mapper.add(Frame(IMAGE, 5, 0, PosePrior(LOOKS_DOWN, position_m=np.zeros(3))))
+    with pytest.raises(ValueError, match=fault):
+        mapper.add(frame)
+    assert mapper.add(Frame(IMAGE, 9, 9))  # it changed nothing
+
+
+def test_lists_are_no_camera_model() -> None:
+    with pytest.raises(ValueError, match="arrays of NumPy"):
+        Mapper(Camera(CAMERA.K.tolist(), CAMERA.distortion, CAMERA.size_px))  # type: ignore[arg-type]
+
+
 def test_no_frame_comes_between_the_two_numbers_of_a_spacing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
