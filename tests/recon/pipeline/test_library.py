@@ -80,7 +80,7 @@ LOOKS_DOWN = np.diag([1.0, -1.0, -1.0])
     ("frame", "fault"),
     [
         (Frame(IMAGE[:, :, 0], 9, 9), r"\(60, 80, 3\) uint8 by the camera model, not \(60, 80\) "),
-        (Frame(IMAGE.astype(np.float32), 9, 9), "not .* float32"),  # type: ignore[arg-type]
+        (Frame(IMAGE.astype(np.float32), 9, 9), "not .* float32"),
         (Frame(np.zeros((80, 60, 3), np.uint8), 9, 9), r"not \(80, 60, 3\)"),
         (Frame(np.zeros((120, 160, 3), np.uint8), 9, 9), r"not \(120, 160, 3\)"),
         (Frame(None, 9, 9), "not None"),  # type: ignore[arg-type]
@@ -105,7 +105,7 @@ def test_a_frame_that_cannot_be_used_is_refused_by_name(frame: Frame, fault: str
 
 def test_lists_are_no_camera_model() -> None:
     with pytest.raises(ValueError, match="arrays of NumPy"):
-        Mapper(Camera(CAMERA.K.tolist(), CAMERA.distortion, CAMERA.size_px))  # type: ignore[arg-type]
+        Mapper(Camera(CAMERA.K.tolist(), CAMERA.distortion, CAMERA.size_px))
 
 
 def test_no_frame_comes_between_the_two_numbers_of_a_spacing(
@@ -181,7 +181,7 @@ def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:
 def test_every_name_of_the_library_is_there() -> None:
     assert all(getattr(recon, name) is not None for name in recon.__all__)
     with pytest.raises(AttributeError, match="nothing"):
-        recon.nothing  # noqa: B018
+        recon.nothing  # noqa: B018  # type: ignore[attr-defined]
 
 
 def test_the_library_needs_nothing_of_the_service() -> None:
