@@ -7,9 +7,11 @@ service or the computer crashed; its text identifies the boot of the computer.
 from __future__ import annotations
 
 import logging
-import os
 from enum import Enum, auto
 from pathlib import Path
+
+from service.errors import OutsideError
+from service.scans.writing import sync, write_whole
 
 log = logging.getLogger(__name__)
 
@@ -44,24 +46,16 @@ class Resumption:
         """Mark a running scan that must resume after a crash."""
         self.left = Left.NOTHING
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with self._path.open("w", encoding="utf-8") as file:
-                file.write(self._boot())
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            log.warning("%s: a restart in flight will not resume the scan: %s", self._path, error)
+            write_whole(self._path, self._boot())
+        except OutsideError as error:
+            log.warning("a restart in flight will not resume the scan: %s", error)
 
     def forget(self) -> None:
         """Remove the mark: no scan runs, or none need resume."""
         self.left = Left.NOTHING
         try:
             self._path.unlink()
-            folder = os.open(self._path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)  # or a power cut within seconds of a stop brings the mark back
-            finally:
-                os.close(folder)
+            sync(self._path.parent)  # or a power cut within seconds of a stop brings the mark back
         except FileNotFoundError:
             pass
         except OSError as error:

@@ -225,6 +225,7 @@ class Scanning:
         self._marks: list[Any] | None = None  # of the closing, as seen last
         self._marked_s = 0.0  # when they changed
         self._following: CameraSource | None = None  # the camera, open, for the next run
+        self._is_reshaped = False  # it went over to images of another shape, of this wanted scan
 
     def load(self) -> None:
         """Load camera model and backend, which takes long; InputError if they are unusable."""
@@ -253,7 +254,9 @@ class Scanning:
             scan = self.scan
             if event is Event.GROWN:
                 self.is_warm = True
-            unused = None if self.life.state.is_wanted else self._take_following()
+            unused = None
+            if not self.life.state.is_wanted:
+                unused, self._is_reshaped = self._take_following(), False
         if Effect.CLOSE in effects and scan is not None:
             scan.source.close()  # wakes it where the camera is dead; may take long
         if unused is not None:
@@ -447,6 +450,7 @@ class Scanning:
             began_s = time.monotonic()
             try:
                 source = (self._opener or open_camera)(self.config.camera.source)
+                source.is_reshaped = self._is_reshaped
                 return source if isinstance(source, Paced) else Paced(source)
             except OutsideError as error:
                 log.warning("%s; trying again", error)
@@ -549,6 +553,7 @@ class Scanning:
             with self._lock:
                 if not run.stop.is_set():
                     self._following = source.following()
+                    self._is_reshaped |= self._following is not None
             event = Event.COMPLETED if self._following is None else Event.INTERRUPTED
         finally:
             run.is_feeding = False

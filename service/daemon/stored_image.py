@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mavlink.component.camera import KeyframeReport
 from recon.types import U8
+from service.scans.writing import sync
 
 QUALITY = 90
 MIN_FREE_MIB = 500.0  # no image is stored with less, and the self-test fails
@@ -32,12 +33,12 @@ def store_image(path: Path, image: U8, tag: KeyframeReport | None = None) -> Non
     exif = Image.Exif()
     exif[GPS] = {} if tag is None else _position(tag)
     part = path.with_suffix(".part")
-    with part.open("wb") as file:
-        Image.fromarray(image[:, :, ::-1]).save(file, "JPEG", quality=QUALITY, exif=exif)
-        if tag is not None:  # it is reported as taken; a power cut may not leave it empty
-            file.flush()
-            os.fsync(file.fileno())
+    Image.fromarray(image[:, :, ::-1]).save(part, "JPEG", quality=QUALITY, exif=exif)
+    if tag is not None:  # it is reported as taken; a power cut may not leave it empty
+        sync(part)
     os.replace(part, path)
+    if tag is not None:
+        sync(path.parent)
 
 
 def _position(tag: KeyframeReport) -> dict[int, object]:

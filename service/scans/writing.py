@@ -19,16 +19,25 @@ SUMMARY = "scan.json"
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """A temporary path of the calling thread for ``path``; renamed onto it on success, otherwise
-    removed.
+    """A temporary path of the calling thread for ``path``; renamed onto it on success, and on the
+    disk then, otherwise removed.
 
     A disk failure becomes an OutsideError.
     """
     with _beside(path) as part:
         yield part
-        with open(part, "rb+") as written:
-            os.fsync(written.fileno())
+        sync(part)
         os.replace(part, path)
+        sync(path.parent)  # or a power cut within seconds takes the name away
+
+
+def sync(path: Path) -> None:
+    """Write a file, or the names in a folder, through to the disk; OSError when it fails."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def write_whole(path: Path, data: bytes | str) -> None:

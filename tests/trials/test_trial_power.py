@@ -16,9 +16,10 @@ import signal
 import struct
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
 from loopback import free_port, until
@@ -27,7 +28,10 @@ from trial_autopilot import Autopilot
 from trial_ground import Ground
 from trial_rig import WHOLE, Chunk, Row, Service, back_limit_s, scan_folders, stored
 
+from mavlink.component.camera import KeyframeReport
 from service.daemon.resumption import MARK
+from service.daemon.stored_image import store_image
+from service.scans.writing import write_whole
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(7200 if WHOLE else 280)]
 
@@ -110,6 +114,22 @@ def cut(service: Service, disk: Disk) -> set[Chunk]:
     if mark.exists():
         mark.write_text("the boot before")  # the machine of this trial runs on
     return acknowledged
+
+
+def write_photo(path: Path) -> None:
+    store_image(path, np.zeros((48, 64, 3), np.uint8), KeyframeReport())
+
+
+@pytest.mark.parametrize("write", [write_photo, lambda path: write_whole(path, "kept")])
+def test_a_file_that_was_reported_survives_a_power_cut(
+    write: Callable[[Path], None], disk: Disk
+) -> None:
+    path = disk.place / "folder" / "1.jpg"
+    write(path)
+    disk.cut()
+    disk.unmount()
+    disk.mount()
+    assert path.stat().st_size > 0
 
 
 def command(number: int) -> object:

@@ -23,6 +23,7 @@ from service.daemon.resumption import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
 from service.daemon.scan_state import Event, State
 from service.daemon.scanning import Scanning, ScanRun
+from service.errors import OutsideError
 from service.flight.scan import short_collections
 from service.stream.store import ScanStore
 from service.workers import Worker, Workers
@@ -108,6 +109,35 @@ def test_another_shape_of_a_live_stream_begins_another_scan(tmp_path: Path) -> N
             summary = store.summary or {}
             assert store.header.camera["height"] == height
             assert warned[height] in " ".join(summary["warnings"]) and "interrupted" not in summary
+
+
+def test_a_fault_after_another_shape_does_not_make_it_unfit(tmp_path: Path) -> None:
+    """The camera is opened again, and still gives that shape."""
+    first, later = ((20, (320, 240)), (20, (320, 180))), ((1000, (320, 180)),)
+    given = iter((first, later))
+
+    def open_camera(_: str) -> Paced:
+        parts = (clip(*part) for part in next(given))
+        return Paced(LiveSource(opener(*parts), "gimbal", LiveConfig(changed_s=0.2)))
+
+    faults = iter((None, OutsideError("the disk is away")))
+
+    class Failing(Scanning):
+        def _inputs(self, *given: Any) -> Any:
+            if (fault := next(faults, None)) is not None:
+                raise fault
+            return super()._inputs(*given)
+
+    daemon = Onboard(tmp_path, opener=open_camera, of=Failing)
+    scanning = daemon.scanning
+    daemon.equip()
+    scanning.start()
+    first_scan = until(lambda: scanning.scan)
+    until(lambda: scanning.handle(Event.TICK) and scanning.scan not in (None, first_scan))
+    assert scanning.fault == "" and "Scan failed: the disk is away" in daemon.vehicle.said
+    assert scanning.scan is not None and scanning.scan.inputs.camera.size_px == (320, 180)
+    scanning.end()
+    assert not scanning._is_reshaped
 
 
 def test_a_stop_closes_the_camera_that_the_next_scan_would_take(tmp_path: Path) -> None:
