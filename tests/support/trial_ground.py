@@ -224,17 +224,15 @@ class Watch:
     """
 
     def __init__(self, ground: Ground, name: str) -> None:
-        self.ages_s: list[tuple[float, float]] = []  # (monotonic time, age) of each that came
+        self.oldest_s = 0.0  # the greatest age, the first poses left out
         self._place, self._last = ground.store / "drones" / name, 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
-    def end(self) -> list[tuple[float, float]]:
-        """When each pose came after the first ones, and its age then, s."""
+    def close(self) -> None:
         self._stop.set()
         self._thread.join()
-        return self.ages_s
 
     def _run(self) -> None:
         seen: set[int] = set()
@@ -245,9 +243,9 @@ class Watch:
                     query = "SELECT id, time_unix_ns FROM poses WHERE id > ?"
                     rows = db.execute(query, (self._last - 200,)).fetchall()
                     db.close()
-                    now, at_s = time.time_ns(), time.monotonic()
-                    fresh = [row for row in rows if row[0] not in seen]
-                    if seen:
-                        self.ages_s += [(at_s, (now - time_ns) * 1e-9) for _, time_ns in fresh]
-                    seen |= {row[0] for row in fresh}
+                    fresh = {number: time_ns for number, time_ns in rows if number not in seen}
+                    if seen and fresh:
+                        age_s = (time.time_ns() - min(fresh.values())) * 1e-9
+                        self.oldest_s = max(self.oldest_s, age_s)
+                    seen |= fresh.keys()
                     self._last = max(seen, default=0)
