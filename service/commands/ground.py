@@ -145,6 +145,7 @@ class GroundOptions:
 def ground(given: GroundOptions) -> None:
     """Receive scans from drones; end with Ctrl-C. Scans: STORE/drones/DRONE/SCAN."""
     from service.ground import live_site
+    from service.ground.due import MESH
     from service.ground.receiver import Receiver
     from service.ground.sites import Sites
     from service.init_system import Notifier
@@ -162,6 +163,8 @@ def ground(given: GroundOptions) -> None:
             sites.put(folder)
         if page is not None:
             page.ended(folder)
+        elif given.meshes:
+            MESH.mark(folder)  # for the next portal
 
     receiver = Receiver(config, workers, ended=ended)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in given.mavlink or []]

@@ -1,7 +1,7 @@
-"""The mesh of a scan that has ended: made unasked, as the portal shows a finished scan by it.
+"""The meshes of scans that have ended: made unasked, as the portal shows a finished scan by it.
 
-It waits until no scan grows and nothing that was asked for waits, and is a process of low priority,
-which also stops for what is asked for meanwhile and then begins again.
+They wait until no scan grows and nothing that was asked for waits, and are made by a process of low
+priority, which also stops for what is asked for meanwhile and then begins again.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
 
-from service.errors import InputError
+from service.errors import InputError, OutsideError, SkyreliefError
+from service.ground.due import MESH
 from service.ground.library import UNREADABLE
 from service.ground.products import PRODUCTS, obstacle
 from service.ground.scan_facts import facts_of, is_current
@@ -37,29 +38,53 @@ MESH_S = 7200.0
 """One mesh may take so long; a scan may come from a stranger."""
 
 
-def queue_mesh(jobs: Jobs, folder: Path, may_begin: Callable[[], bool]) -> None:
-    """Have the mesh of the finished scan in ``folder`` made once ``may_begin``; nothing happens
-    where there is one. The log says why a scan gets none."""
-    try:
-        facts = facts_of(folder)
-        points = facts.get("counts", {}).get("points", 0)
-        if not facts["finished"] or is_current(folder / FILE) or not 0 < points <= MAX_POINTS:
+def queue_meshes(jobs: Jobs, store: Path, may_begin: Callable[[], bool]) -> None:
+    """Have the meshes that are due made once ``may_begin``, as many as may wait; the rest is for
+    another call. The log says why a scan gets none."""
+    for folder in MESH.folders(store, with_begun=False):
+        try:
+            is_wanted = _is_wanted(folder)
+        except UNREADABLE as error:
+            log.info("%s gets no mesh: %s", folder, error)
+            if isinstance(error, OutsideError):  # no room now
+                continue
+            is_wanted = False
+        if not is_wanted:
+            drop(folder)
+            continue
+        try:
+            jobs.start(folder, KIND, partial(_make, folder), may_begin=may_begin)
+        except SkyreliefError:  # enough wait, or the station ends
             return
-        why = obstacle(KIND, facts["origin"] is not None)
-        if why is not None:
-            raise InputError(f"it {why}")
-        check_room(round(points * PRODUCTS[KIND][2]), folder)
-        needed, free = BASE_BYTES + POINT_BYTES * points, psutil.virtual_memory().available
-        if needed > free:
-            raise InputError(f"it takes {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} are free")
-        jobs.start(folder, KIND, partial(_make, folder), may_begin=may_begin)
-    except UNREADABLE as error:
-        log.info("%s gets no mesh: %s", folder, error)
+
+
+def drop(folder: Path) -> None:
+    """The mesh of a scan is not due any more."""
+    MESH.begin(folder)
+    MESH.end(folder)
+
+
+def _is_wanted(folder: Path) -> bool:
+    """Whether the scan is finished and has no mesh. Raises InputError where it can have none,
+    OutsideError where there is too little room for one now."""
+    facts = facts_of(folder)
+    points = facts.get("counts", {}).get("points", 0)
+    if not facts["finished"] or is_current(folder / FILE) or not 0 < points <= MAX_POINTS:
+        return False
+    why = obstacle(KIND, facts["origin"] is not None)
+    if why is not None:
+        raise InputError(f"it {why}")
+    check_room(round(points * PRODUCTS[KIND][2]), folder)
+    needed, free = BASE_BYTES + POINT_BYTES * points, psutil.virtual_memory().available
+    if needed > free:
+        raise OutsideError(f"it takes {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} are free")
+    return True
 
 
 def _make(folder: Path, progress: Progress) -> str:
     """Run ``skyrelief mesh``; the name of its file. Raises InputError with its last line, or when
     it takes too long."""
+    MESH.begin(folder)
     deadline = time.monotonic() + MESH_S
 
     def goes_on(line: str) -> bool:

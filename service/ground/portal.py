@@ -12,6 +12,7 @@ from typing import Any
 
 from service.errors import InputError, outside
 from service.ground.basemap import open_basemap
+from service.ground.due import MESH
 from service.ground.guard import (
     MAX_BODY_BYTES,
     Pace,
@@ -24,7 +25,7 @@ from service.ground.guard import (
 from service.ground.http import portal_app
 from service.ground.library import Library
 from service.ground.live_map import LiveMap
-from service.ground.meshing import queue_mesh
+from service.ground.meshing import KIND, drop, queue_meshes
 from service.ground.state import REFINE, Job, Jobs, OpenScans, PortalState
 from service.ground.storage import DroneLimits
 from service.ground.vehicle import Vehicle
@@ -92,7 +93,7 @@ class Portal:
         self.jobs = Jobs(self._workers)
         below = None if config.basemap is None else open_basemap(config.basemap)
         library = Library(config.store)
-        self.jobs.made = self._made
+        self.jobs.ended = self._job_ended
         self.state = PortalState(
             library, self.jobs, progress or list, vehicle, below, config.limits,
             OpenScans(LiveCoverage, config.coverage_age_s, max_scans=4),
@@ -116,14 +117,24 @@ class Portal:
     def ended(self, folder: Path) -> None:
         """Have the mesh of a scan that has ended made, once none grows; from any thread."""
         if self.config.meshes:
-            queue_mesh(self.jobs, folder, lambda: not self.state.is_receiving)
+            MESH.mark(folder)
+            self._queue_meshes()
 
-    def _made(self, job: Job) -> None:
-        """A recording has become a scan, or a scan was refined."""
+    def _queue_meshes(self) -> None:
+        queue_meshes(self.jobs, self.config.store, lambda: not self.state.is_receiving)
+
+    def _job_ended(self, job: Job) -> None:
+        """A recording has become a scan, or a scan was refined, or another mesh may wait."""
         if job.kind == "scan" and job.file is not None:
             self.ended(self.state.library.folder(*job.file.split("/")))
-        elif job.kind == REFINE:
+        elif job.kind == REFINE and job.state == "done":
             self.ended(job.folder)
+        elif job.kind == KIND:
+            if job.state == "cancelled":
+                drop(job.folder)
+            MESH.end(job.folder)
+            if self.config.meshes:
+                self._queue_meshes()
 
     def start(self) -> None:
         """Begin to serve; raises OutsideError when the address cannot be used."""
@@ -132,6 +143,10 @@ class Portal:
         if not is_loopback(config.host) and not config.tls:
             log.warning("portal on %s without TLS: the token can be read in transit", config.host)
         self._worker = self._workers.start("portal", self._run)
+        if config.meshes:
+            for folder in MESH.folders(config.store):  # also what a former process had begun
+                MESH.mark(folder)
+            self._queue_meshes()
 
     def _open(self, port: int) -> None:
         """Listen, with a new server. Raises OutsideError when the address cannot be used."""

@@ -1,77 +1,16 @@
-"""A scan that is being received, and the files of scans that are yet to be written.
-
-A marker file in the scan's folder shows that it grew since its files were written. It is renamed
-while they are written and deleted afterwards, so a kill at any time leaves one of the two names.
-"""
+"""A scan that is being received: the state of its files, and its figures."""
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from service.errors import InputError, OutsideError
+from service.ground.due import FILES
 from service.ground.intake import ScanIntake
-from service.ground.storage import is_regular, scan_files
-from service.scans.folder import write_deliverables
-from service.scans.writing import files_due
-from service.stream.store import ScanStore
-from service.workers import guarded
-
-MARK, BEGUN = ".files-due", ".files-begun"
-
-
-def mark_due(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # a full disk is reported where the scan itself is written
-        (folder / MARK).touch()
-
-
-def folders_due(store: Path) -> list[Path]:
-    """The folders with files yet to be written, those of the newest scans first."""
-    found = {path.parent for name in (MARK, BEGUN) for path in scan_files(store, name)}
-    sound = [folder for folder in found if is_regular(folder / "scan.db")]
-    return sorted(sound, key=lambda folder: folder.name, reverse=True)
-
-
-def deliver(folder: Path) -> None:
-    """Write the scan's deliverables; InputError names those which could not be made."""
-    with ScanStore.peek(folder / "scan.db") as store:  # others may write
-        failed = write_deliverables(folder, store)["failed"]
-    if failed:
-        why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
-        raise InputError(f"some could not be made: {why}")
-
-
-def write_files(
-    folder: Path, deliver: Callable[[Path], None] = deliver, is_left: bool = False
-) -> tuple[str, bool]:
-    """Have ``deliver`` write a scan's files; what went wrong, and whether the disk refused one.
-
-    That stays due, whatever an earlier ``scan.json`` says; a fault in the scan would come again.
-    """
-    is_refused = False
-
-    def work() -> None:
-        nonlocal is_refused
-        try:
-            if is_left:  # by a former process: what a crash damaged is repaired
-                ScanStore.open(folder / "scan.db").close()
-            deliver(folder)
-        except (OutsideError, OSError):
-            is_refused = True
-            raise
-
-    with contextlib.suppress(OSError):
-        (folder / MARK).replace(folder / BEGUN)
-    trouble = guarded(f"deliverables of {folder}", work)
-    if not is_refused and not files_due(folder):
-        (folder / BEGUN).unlink(missing_ok=True)
-    return trouble, is_refused
 
 
 class Files(Enum):
@@ -125,7 +64,7 @@ class ReceivedScan:
     def grew(self) -> None:
         """Something new was stored: its files are due, also for the next process."""
         if not self.is_due:
-            mark_due(self.folder)
+            FILES.mark(self.folder)
         self.changed = True
         self.note(Change.GREW)
 

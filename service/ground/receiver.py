@@ -28,8 +28,9 @@ import zenoh
 
 from service.errors import InputError, SkyreliefError
 from service.ground import drone
+from service.ground.due import FILES, deliver, write_files
 from service.ground.front import behind_fronts
-from service.ground.received import ReceivedScan, deliver, folders_due, write_files
+from service.ground.received import ReceivedScan
 from service.ground.storage import DroneLimits
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
@@ -168,7 +169,7 @@ class Receiver:
                     front.close()
                 raise
             log.debug("%s", error)  # a station that only connects waits for its router
-        self._left = folders_due(self._config.store)
+        self._left = FILES.folders(self._config.store)
         self._running = [
             start("receiver", self._run),
             *(start(f"front {front.endpoint}", front.run) for front in fronts),

@@ -120,8 +120,8 @@ class Jobs:
         """``carry_out`` makes a job's deliverable; an ended job is listed for ``shown_s``."""
         self._workers, self._shown_s = workers, shown_s
         self.carry_out = carry_out
-        self.made: Callable[[Job], None] = lambda _: None
-        """Called with each job that has made something."""
+        self.ended: Callable[[Job], None] = lambda _: None
+        """Called with each job that has ended, but not by the end of the station."""
         self._worker: Worker | None = None  # while jobs wait
         self._lock = threading.Lock()
         self._jobs: list[Job] = []  # replaced, not changed, so that anybody may iterate over it
@@ -193,11 +193,15 @@ class Jobs:
             found = [j for j in self._jobs if j.number == number and not j.has_ended]
             if not found:
                 raise MissingError(f"no job {number} is waiting or running")
-            found[0].gives_way = False
-            found[0].progress.cancel()
-            if found[0].state == "waiting":
-                found[0].end("cancelled")
-            return found[0].shown()
+            (job,) = found
+            job.gives_way = False
+            job.progress.cancel()
+            was_waiting = job.state == "waiting"
+            if was_waiting:
+                job.end("cancelled")
+        if was_waiting:
+            self.ended(job)
+        return job.shown()
 
     def close(self) -> None:
         """Cancel all jobs, take no more, and wait a while until the one that runs has left its
@@ -235,8 +239,8 @@ class Jobs:
                 log.info("%s of %s: %s", job.kind, job.folder, job.error)
                 with self._lock:
                     self._jobs = [one for one in self._jobs if one is not job]
-            elif job.state == "done":
-                guarded("exports", partial(self.made, job))
+            if job.has_ended and not self._is_closed:
+                guarded("exports", partial(self.ended, job))
 
     def _run(self, job: Job) -> None:
         try:

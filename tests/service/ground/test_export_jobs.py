@@ -189,11 +189,11 @@ def test_nothing_begins_once_the_station_closes(tmp_path: Path) -> None:
 
 
 def test_a_fault_in_what_follows_a_job_does_not_stop_the_others(tmp_path: Path) -> None:
-    def made(_: Job) -> None:
+    def ended(_: Job) -> None:
         raise RuntimeError("can't start new thread")
 
     jobs = Jobs(Workers(), lambda _: "scan.kml")
-    jobs.made = made
+    jobs.ended = ended
     for kind in ("kml", "laz"):
         jobs.start(tmp_path, kind)
     assert until(lambda: [job["state"] for job in jobs.of(tmp_path)] == ["done", "done"])

@@ -16,7 +16,7 @@ from house_flight import HouseFlight
 from paths import ROOT
 
 from service.errors import OutsideError
-from service.ground.received import BEGUN, MARK, deliver, folders_due, mark_due, write_files
+from service.ground.due import FILES, deliver, write_files
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
 from service.stream.session import SessionConfig
@@ -132,20 +132,20 @@ def test_files_that_a_killed_station_left_are_written_at_the_next_start(
 ) -> None:
     folder = tmp_path / "drone-1" / "test-1"
     house.flown(folder).close()
-    mark_due(folder)
+    FILES.mark(folder)
     if killed == "while writing":
-        (folder / MARK).rename(folder / BEGUN)
-    assert folders_due(tmp_path) == [folder]
+        FILES.begin(folder)
+    assert FILES.folders(tmp_path) == [folder]
     station = Receiver(ReceiverConfig(tmp_path, SessionConfig(mode="peer")))
     station.start()
     try:
         for _ in range(1200):
-            if not folders_due(tmp_path):
+            if not FILES.folders(tmp_path):
                 break
             time.sleep(0.1)
     finally:
         station.close()
-    assert folders_due(tmp_path) == []
+    assert FILES.folders(tmp_path) == []
     names = {path.name for path in folder.iterdir()}
     assert {CLOUD, TUM, CSV, PREVIEW, "scan.json", "report.html"} <= names
     assert not {".files-due", ".files-begun"} & names
@@ -155,19 +155,19 @@ def test_what_comes_while_files_are_written_is_due_again(
     tmp_path: Path, house: HouseFlight
 ) -> None:
     folder = tmp_path / "drone-1" / "test-1"
-    mark_due(folder)  # of a folder that is gone: nothing happens
+    FILES.mark(folder)  # of a folder that is gone: nothing happens
     house.flown(folder).close()
 
     def grows_meanwhile(folder: Path) -> None:
-        assert folders_due(tmp_path) == [folder]
-        mark_due(folder)
+        assert FILES.folders(tmp_path) == [folder]
+        FILES.mark(folder)
         deliver(folder)
 
-    mark_due(folder)
+    FILES.mark(folder)
     assert write_files(folder, grows_meanwhile) == ("", False)
-    assert folders_due(tmp_path) == [folder]
+    assert FILES.folders(tmp_path) == [folder]
     assert write_files(folder) == ("", False)
-    assert folders_due(tmp_path) == []
+    assert FILES.folders(tmp_path) == []
 
 
 @pytest.mark.parametrize("error", [OutsideError("disk full"), OSError("disk full"), ValueError()])
@@ -184,7 +184,7 @@ def test_only_files_that_the_disk_refused_are_written_again(
     for is_written in (False, True):
         if is_written:
             deliver(folder)
-        mark_due(folder)
+        FILES.mark(folder)
         trouble, is_due = write_files(folder, fail)
         assert trouble and is_due == (not isinstance(error, ValueError))
-        assert (folders_due(tmp_path) == [folder]) == (is_due or not is_written)
+        assert (FILES.folders(tmp_path) == [folder]) == (is_due or not is_written)

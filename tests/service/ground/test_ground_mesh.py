@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 import zipfile
 from pathlib import Path
@@ -13,6 +14,7 @@ from house_flight import HouseFlight
 from loopback import until
 from portal_client import TOKEN, flown_store
 
+from service.ground.due import MESH
 from service.ground.library import Library
 from service.ground.portal import Portal, PortalConfig
 from service.ground.scan_facts import is_current
@@ -84,6 +86,35 @@ def test_nothing_is_made_where_nobody_wants_it_or_it_does_not_fit(
     monkeypatch.setattr("shutil.disk_usage", lambda _: FullDisk())
     portal.ended(folder)
     assert not portal.jobs.of(folder)
+
+
+def test_meshes_that_did_not_fit_or_were_cut_off_are_made_later(
+    folder: Path, tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the next portal, or once another has ended; also of scans that ended before a portal."""
+    growing = [{"drone": "drone-2", "scan": "b", "finished": False, "heard_unix_s": 1e12}]
+    monkeypatch.setattr("service.ground.state.MAX_WAITING_JOBS", 1)
+    other = folder.with_name("test-0")
+    shutil.copytree(folder, other)
+    first = portal_of(folder, growing, meshes=True)
+    for one in (folder, other):
+        first.ended(one)
+    assert len(first.jobs.listed()) == 1
+    first.close()
+    MESH.begin(folder)  # as by a kill
+    second = portal_of(folder, growing, meshes=True)
+    try:
+        second.start()
+        assert [job["state"] for job in second.jobs.of(folder)] == ["waiting"]
+        assert not second.jobs.of(other)
+        second.jobs.cancel(second.jobs.of(folder)[0]["number"])  # by a person: it is not wanted
+        assert [job["state"] for job in second.jobs.of(other)] == ["waiting"]
+        growing.clear()
+        assert until(lambda: second.jobs.of(other)[0]["state"] == "done", 60)
+        assert until(lambda: not MESH.folders(tmp_path / "scans"))
+        assert not (folder / "mesh.glb").exists()
+    finally:
+        second.close()
 
 
 def test_a_mesh_stays_that_of_its_scan_when_it_is_imported(folder: Path, tmp_path: Path) -> None:
