@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 
 ASK_TIMEOUT_S = 120.0
 RETRY_S, LOOK_AROUND_S, LOOK_S = 1.0, 3.0, 0.2
+DROP = zenoh.CongestionControl.DROP
 CHANNEL = 256
 """Messages that may wait in the session, of one kind or to one request."""
 TICK_S, MAX_REST_S = 0.1, 0.5
@@ -364,46 +365,40 @@ class Receiver:
     # Effects
 
     def _perform(self, one: Drone, effect: drone.Effect) -> None:
-        """Carry out what a drone's worker has decided; what follows is put into it."""
+        """Carry out what a drone's worker has decided; what follows is put into it.
+
+        Without a session nothing is sent: what it was for is due again.
+        """
+        session, high = self._session, zenoh.Priority.INTERACTIVE_HIGH
         match effect:
-            case drone.Put() | drone.Get():
-                self._send(one, effect)
             case drone.Write():
                 self._writes.put((effect, one))
             case drone.Opened(scan):
                 self._opened(scan)
+            case drone.Put() if session is not None:
+                with contextlib.suppress(zenoh.ZError):
+                    session.put(*effect, priority=high, congestion_control=DROP, express=True)
+            case drone.Get() if session is not None:
+                with contextlib.suppress(zenoh.ZError):
+                    self._ask(session, one, effect)
 
-    def _send(self, one: Drone, effect: drone.Put | drone.Get) -> None:
-        """Put or get; nothing happens while there is no session.
-
-        A request beyond the drone's share is over at once, so that it is made again after a pause.
-        """
-        session, drop = self._session, zenoh.CongestionControl.DROP
-        if session is None:
+    def _ask(self, session: zenoh.Session, one: Drone, request: drone.Get) -> None:
+        """Send a request. One beyond the drone's share is over at once, so that it is made again
+        after a pause."""
+        one.requests = [taker for taker in one.requests if not taker.is_done]
+        if len(one.requests) >= self.limits.requests // max(1, len(self._busy)):
+            one.put(request.answered)
             return
-        if isinstance(effect, drone.Get):
-            one.requests = [taker for taker in one.requests if not taker.is_done]
-            if len(one.requests) >= self.limits.requests // max(1, len(self._busy)):
-                one.put(effect.answered)
-                return
-        try:
-            if isinstance(effect, drone.Put):
-                high = zenoh.Priority.INTERACTIVE_HIGH
-                session.put(*effect, priority=high, congestion_control=drop, express=True)
-                return
-            replies = session.get(
-                effect.key,
-                zenoh.handlers.FifoChannel(CHANNEL),
-                payload=effect.payload,
-                priority=zenoh.Priority.BACKGROUND,
-                congestion_control=drop,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=ASK_TIMEOUT_S,
-            )
-        except zenoh.ZError as error:
-            log.debug("%s is not sent: %s", effect.key, error)
-            return
-        answered = partial(one.put, effect.answered)
+        replies = session.get(
+            request.key,
+            zenoh.handlers.FifoChannel(CHANNEL),
+            payload=request.payload,
+            priority=zenoh.Priority.BACKGROUND,
+            congestion_control=DROP,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=ASK_TIMEOUT_S,
+        )
+        answered = partial(one.put, request.answered)
         one.requests.append(self._take_from("replies", replies, answered))
 
     def _write_all(self, worker: Worker) -> None:
