@@ -11,6 +11,8 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1  # mallopt(3)
 
@@ -31,6 +33,18 @@ def one_pool() -> bool:
     libc.mallopt(M_MMAP_THRESHOLD, POOLED_BYTES)
     libc.mallopt(M_TRIM_THRESHOLD, SPARE_BYTES)
     return bool(libc.mallopt(M_ARENA_MAX, 1) == 1)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Import modules inside: what they hold is never garbage, and the collector of garbage would
+    look at all of it again and again."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def release_memory(collect: bool = False) -> bool:

@@ -62,7 +62,11 @@ class Decoded:
 
 def frame_bgr(frame: av.VideoFrame) -> U8:
     """(H, W, 3) BGR of a decoded image."""
-    return np.ascontiguousarray(frame.to_ndarray(format="bgr24"), dtype=np.uint8)
+    from av.video.reformatter import VideoReformatter
+
+    # Without a number of threads each image would start as many as there are cores.
+    frame = VideoReformatter().reformat(frame, format="bgr24", threads=1)
+    return np.ascontiguousarray(frame.to_ndarray(), dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -62,24 +62,25 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Reconstruct a recording (video, folder of images or pipe) into a scan folder."""
-    from service.memory import one_pool
+    from service.memory import loading, one_pool
 
     one_pool()
-    from service.cameras import open_camera, parse_source
-    from service.cameras.camera_file import load_camera
-    from service.cameras.source import Paced
-    from service.commands.adjusted_stills import adjusted_stills
-    from service.commands.missing_metadata import (
-        load_log,
-        own_telemetry,
-        start_of,
-        with_own_lens,
-        with_stated_readout,
-    )
-    from service.compute.backend_choice import open_backend
-    from service.config import is_given, load_config
-    from service.flight.scan import ScanInputs, check_new
-    from service.scans.writing import check_writable
+    with loading():
+        from service.cameras import open_camera, parse_source
+        from service.cameras.camera_file import load_camera
+        from service.cameras.source import Paced
+        from service.commands.adjusted_stills import adjusted_stills
+        from service.commands.missing_metadata import (
+            load_log,
+            own_telemetry,
+            start_of,
+            with_own_lens,
+            with_stated_readout,
+        )
+        from service.compute.backend_choice import open_backend
+        from service.config import is_given, load_config
+        from service.flight.scan import ScanInputs, check_new
+        from service.scans.writing import check_writable
 
     overrides = list(set_ or [])
     if backend is not None:
