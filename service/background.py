@@ -12,7 +12,7 @@ from queue import SimpleQueue
 from threading import Condition, Event
 from typing import Generic, TypeVar
 
-from service.workers import PROCESS, Worker
+from service.workers import PROCESS
 
 T = TypeVar("T")
 In = TypeVar("In")
@@ -91,17 +91,18 @@ class Channel(Generic[T]):
 
 
 class BackgroundWorker(Generic[In, Out]):
-    """Runs ``work`` on offered items, in order, on a thread of the table.
+    """Runs ``work`` on offered items, in order, on a thread of the table, and what ``work`` returns
+    on another one: the second half of an item's work, while the first of the next begins.
 
     When the queue is full, :meth:`offer` waits; live, the oldest item that has not begun is dropped
-    instead and counted in :attr:`dropped`, if it ``counts``. Without a row, :meth:`offer` does the
+    instead and counted in :attr:`dropped`, if it ``counts``. Without rows, :meth:`offer` does the
     work itself.
     """
 
     def __init__(
         self,
-        row: str | None,
-        work: Callable[[In], Out],
+        rows: tuple[str, str] | None,
+        work: Callable[[In], Callable[[], Out]],
         bound: int,
         live: bool = False,
         counts: Callable[[In], bool] = lambda _: True,
@@ -109,16 +110,10 @@ class BackgroundWorker(Generic[In, Out]):
         self._work, self._bound, self._live, self._counts = work, bound, live, counts
         self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once
         self.dropped = 0
-        self._began_s: list[float] = []  # start of the current work, if any
         self._ends, self._patience_s = Event(), 0.0
-        self._todo: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._worker: Worker | None = None
-        if row is not None:
-            todo, began_s = self._todo, self._began_s
-            self._worker = PROCESS.start(
-                row, lambda _: _run(todo), todo.qsize, lambda: _since(began_s)
-            )
-            weakref.finalize(self, todo.put, None)  # also when it is never closed
+        self._halves = [_Half(row) for row in rows or ()]
+        for half in self._halves:
+            weakref.finalize(self, half.todo.put, None)  # also when it is never closed
 
     @property
     def is_free(self) -> bool:
@@ -127,8 +122,8 @@ class BackgroundWorker(Generic[In, Out]):
 
     @property
     def busy_s(self) -> float:
-        """Seconds since the current work began; 0 when idle."""
-        return _since(self._began_s)
+        """Seconds since the current work began, the longer of both halves; 0 when idle."""
+        return max((half.busy_s for half in self._halves), default=0.0)
 
     def end_by(self, event: Event, patience_s: float) -> None:
         """Once ``event`` is set, drop what has not begun, and after ``patience_s`` also what has:
@@ -141,10 +136,10 @@ class BackgroundWorker(Generic[In, Out]):
             return
         future: Future[Out] = Future()
         self._offered[future] = item
-        if self._worker is None:
-            self._do(future)
+        if not self._halves:
+            _end(future, lambda: self._work(item)())()
             return
-        self._todo.put(partial(self._do, future))
+        self._halves[0].todo.put(partial(self._begin, future))
         waiting = [future for future in self._offered if not future.done()]
         if len(waiting) <= self._bound + 1:  # one is being worked on
             return
@@ -177,32 +172,58 @@ class BackgroundWorker(Generic[In, Out]):
         return not future.cancel() and bool(wait([future], self._patience_s).done)
 
     def close(self) -> None:
-        """End the thread; queued items are discarded."""
+        """End the threads; queued items are discarded."""
         for future in list(self._offered):
             if future.cancel():
                 del self._offered[future]
-        self._todo.put(None)
-        if self._worker is not None:
-            self._worker.join(0.0 if self._ends.is_set() else None)
+        for half in self._halves:
+            half.todo.put(None)
+            half.worker.join(0.0 if self._ends.is_set() else None)
 
-    def _do(self, future: Future[Out]) -> None:
+    def _begin(self, future: Future[Out]) -> Callable[[], object]:
         if not future.set_running_or_notify_cancel():
-            return
-        self._began_s.append(time.monotonic())
+            return bool  # nothing to pass on
         try:
-            result = self._work(self._offered[future])
+            rest = self._work(self._offered[future])
         except Exception as error:  # raised where the result is taken
-            self._began_s.clear()
-            future.set_exception(error)
-        else:
-            self._began_s.clear()
-            future.set_result(result)
+            return partial(future.set_exception, error)
+        return partial(self._halves[1].todo.put, partial(_end, future, rest))
 
 
-def _run(todo: SimpleQueue[Callable[[], None] | None]) -> None:
+def _end(future: Future[Out], rest: Callable[[], Out]) -> Callable[[], object]:
+    try:
+        return partial(future.set_result, rest())
+    except Exception as error:
+        return partial(future.set_exception, error)
+
+
+_Job = Callable[[], Callable[[], object]]
+"""Returns how to pass on what it made."""
+
+
+class _Half:
+    """A thread that does jobs until one is None."""
+
+    def __init__(self, row: str) -> None:
+        self.todo: SimpleQueue[_Job | None] = SimpleQueue()
+        self._began_s: list[float] = []  # start of the current job, if any
+        todo, began_s = self.todo, self._began_s
+        self.worker = PROCESS.start(
+            row, lambda _: _run(todo, began_s), todo.qsize, lambda: _since(began_s)
+        )
+
+    @property
+    def busy_s(self) -> float:
+        return _since(self._began_s)
+
+
+def _run(todo: SimpleQueue[_Job | None], began_s: list[float]) -> None:
     while (job := todo.get()) is not None:
-        job()
-        del job  # releases the owner, whose finaliser ends this thread
+        began_s.append(time.monotonic())
+        pass_on = job()
+        began_s.clear()
+        pass_on()
+        del job, pass_on  # releases the owner, whose finaliser ends this thread
 
 
 def _since(began_s: list[float]) -> float:

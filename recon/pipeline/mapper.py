@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -34,9 +35,9 @@ from recon.pipeline.interface import (
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import (
     DenseStereo,
+    PlausibleDepth,
     Undistort,
     keyframe_of,
-    plausible_depth,
     without_false_surface,
 )
 from recon.pipeline.surface_map import SurfaceMap
@@ -51,7 +52,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.adjusted_track import AdjustedTrack
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
-from recon.types import Array, Camera, Keyframe, PointCloud, Pose, PosePrior
+from recon.types import U8, Array, Camera, DepthMap, Keyframe, PointCloud, Pose, PosePrior
 
 __all__ = ["Mapper", "MapperConfig"]
 
@@ -59,7 +60,9 @@ Reconstructed = tuple[Pose | None, tuple[Event, ...]]
 """The pose of a view that is in the graph now, None of one that comes again after its first depth;
 and what there is to tell."""
 
-Reconstruct = Callable[[StereoView], Reconstructed]
+Reconstruct = Callable[[StereoView], Callable[[], Reconstructed]]
+"""Work on a view: what it returns is the rest of it, which may go on while work on the next view
+begins, on another thread. Both are in the order of the views."""
 
 COARSER, FIRST_BASE_TO_HEIGHT = 2, 0.02
 """Images of a first depth are smaller by this factor, and its baseline may be shorter."""
@@ -85,7 +88,7 @@ class InTurn:
         self._work, self._done = work, list[tuple[StereoView, Reconstructed]]()
 
     def offer(self, item: StereoView) -> None:
-        self._done.append((item, self._work(item)))
+        self._done.append((item, self._work(item)()))
 
     def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]:
         done, self._done = self._done, []
@@ -101,7 +104,8 @@ class Mapper:
     """One scan: :meth:`add` every frame in the order of time, then call :meth:`finish`.
 
     It has no thread, clock or file of its own. ``worker`` may run :meth:`reconstruct` on another
-    thread, of which ``keyframes``, ``surface`` and the stages of the lower row are then part.
+    thread, of which the stages that make depth are then part, and what that returns on a third,
+    with ``keyframes`` and ``surface``.
     """
 
     def __init__(
@@ -151,6 +155,7 @@ class Mapper:
             DepthFusionConfig(),
         )
         self.stereo = DenseStereo(backend, stereo, dense, self.rejected, self.debug, timing)
+        self.plausible = PlausibleDepth(self.rejected)
         self._first_stereo: DenseStereo | None = None
         if config.first_depths:
             first = replace(stereo, min_base_to_height=FIRST_BASE_TO_HEIGHT, guided=False,
@@ -242,18 +247,24 @@ class Mapper:
             return True
         return key.seq < window[0].seq
 
-    def reconstruct(self, view: StereoView) -> Reconstructed:
-        """One view: its depth from all its partners, its pose, and its new surface."""
+    def reconstruct(self, view: StereoView) -> Callable[[], Reconstructed]:
+        """One view: its depth from all its partners. What is returned finds its pose and its new
+        surface."""
         if view.is_first_depth:
-            first = self._first_depth(view)
-            return None, () if first is None else (KeyframeReady(first, is_first_depth=True),)
+            return self._first_depth(view)
         if self.debug is not None:
             self.debug.clear()
         depth, bgr = self.stereo(view)  # virtual stereo pairs, section 2.1; Eq. 1 to 3
-        if depth is not None:  # nothing that cannot be
-            segments = self.keyframes.graph.segments
-            depth = plausible_depth(view, depth, bgr, segments, self.rejected)
+        if depth is not None:
+            depth = self.plausible(view, depth, bgr)  # nothing that cannot be
         self.stereo.learn(depth)  # how far the relief of the next pairs may reach
+        return partial(self._place, view, depth, bgr, self.plausible.agreement[view.segment])
+
+    def _place(
+        self, view: StereoView, depth: DepthMap | None, bgr: U8, agreement: int
+    ) -> Reconstructed:
+        """The pose of a view, and its new surface."""
+        self.keyframes.graph.segments[view.segment].agreement = agreement
         pose = self.keyframes.add(view, depth)  # ICP onto the keyframe before, pose graph
         if depth is None:
             return pose, ()
@@ -273,25 +284,30 @@ class Mapper:
         self.keyframes.add_surface(view, keyframe)
         return pose, (KeyframeReady(keyframe, stages=dict(self.debug or {})), changed)
 
-    def _first_depth(self, view: StereoView) -> Keyframe | None:
+    def _first_depth(self, view: StereoView) -> Callable[[], Reconstructed]:
         """The new surface that the view's only partner shows, ahead of its whole depth, of which it
-        changes nothing; None where it shows none.
+        changes nothing; none where it shows none.
 
         New ground is in no earlier image, so that the partner is a later frame.
         """
-        predicted, stereo = self.keyframes.predicted(view), self._first_stereo
-        if predicted is None or stereo is None:
-            return None
+        assert self._first_stereo is not None
         with self._timing("first depth"):
-            depth, bgr = stereo(view)
+            depth, bgr = self._first_stereo(view)
             if depth is not None:
                 depth = without_false_surface(view, depth, bgr)
-            stereo.learn(depth)
-            if depth is None or self.keyframes.graph.segments[view.segment].agreement < 0:
-                return None
-            T_odom, pose = predicted
-            sigma_m, fresh = self.surface.peek(depth, view.rows_share, T_odom)
-            return keyframe_of(view, depth, self.exposure.level(bgr), sigma_m, fresh, pose)
+            self._first_stereo.learn(depth)
+        return partial(self._place_first, view, depth, bgr)
+
+    def _place_first(self, view: StereoView, depth: DepthMap | None, bgr: U8) -> Reconstructed:
+        predicted = self.keyframes.predicted(view)
+        if predicted is None or depth is None:
+            return None, ()
+        if self.keyframes.graph.segments[view.segment].agreement < 0:
+            return None, ()
+        T_odom, pose = predicted
+        sigma_m, fresh = self.surface.peek(depth, view.rows_share, T_odom)
+        first = keyframe_of(view, depth, self.exposure.level(bgr), sigma_m, fresh, pose)
+        return None, (KeyframeReady(first, is_first_depth=True),)
 
     def drain(self) -> tuple[Event, ...]:
         """The views still waiting for partners, up to one whose work failed."""

@@ -15,7 +15,6 @@ from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.pipeline.interface import CONTRADICTED, Timing
 from recon.pipeline.views import StereoView
-from recon.posegraph.segments import Segments
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
@@ -227,18 +226,21 @@ def without_false_surface(view: StereoView, depth: DepthMap, bgr: U8) -> DepthMa
     return plausible(drop_edges(depth, bgr), view.frame.prior)
 
 
-def plausible_depth(
-    view: StereoView, depth: DepthMap, bgr: U8, segments: Segments, rejected: Counter[str]
-) -> DepthMap | None:
-    """``depth`` :func:`without_false_surface`; None with nothing left, or where the motion of the
-    view's segment is false."""
-    kept = without_false_surface(view, depth, bgr)
-    segment = segments[view.segment]
-    segment.agreement += -1 if kept is None else 1
-    if kept is not None and not segment.is_false:
-        return kept
-    rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
-    return None
+class PlausibleDepth:
+    """Depth :func:`without_false_surface`, of the segments whose views agree."""
+
+    def __init__(self, rejected: Counter[str]) -> None:
+        self.agreement = Counter[int]()  # by segment, see Segment
+        self._rejected = rejected
+
+    def __call__(self, view: StereoView, depth: DepthMap, bgr: U8) -> DepthMap | None:
+        """The depth; None with nothing left, or where the motion of the view's segment is false."""
+        kept = without_false_surface(view, depth, bgr)
+        self.agreement[view.segment] += -1 if kept is None else 1
+        if kept is not None and self.agreement[view.segment] > 0:
+            return kept
+        self._rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
+        return None
 
 
 def keyframe_of(

@@ -136,7 +136,7 @@ def await_dense(
 ) -> None:
     """Wait for a keyframe that was dropped at a stop: torch aborts a process that ends while it
     computes. One that hangs is left, with the process."""
-    dense = [worker for worker in workers if worker.row.name == "dense"]
+    dense = [worker for worker in workers if worker.row.name in ("dense", "placing")]
     if not all(worker.join(patience_s) for worker in dense):
         sys.stdout.flush()
         end_processes()  # which the end of the interpreter would do

@@ -11,10 +11,12 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import MISSING, dataclass, fields
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -42,12 +44,13 @@ WITHOUT_DEVICE = 12
 class FallbackBackend:
     """A backend on a device, with the CPU as fallback.
 
-    After the first RuntimeError (out of memory, device lost) the CPU repeats the operation and does
-    all further ones; ``failure`` then gives the reason.
+    The device serves one thread at a time. After the first RuntimeError (out of memory, device
+    lost) the CPU repeats the operation and does all further ones; ``failure`` then gives the
+    reason.
     """
 
     def __init__(self, backend: Backend) -> None:
-        self._backend = backend
+        self._backend, self._one = backend, Lock()
         self.failure: str | None = None
 
     def __getattr__(self, name: str) -> Any:
@@ -68,7 +71,8 @@ class FallbackBackend:
     def _run(self, operation: str, *given: object, **named: object) -> Any:
         backend = self._backend
         try:
-            return getattr(backend, operation)(*given, **named)
+            with self._one if backend.name != "cpu" else nullcontext():
+                return getattr(backend, operation)(*given, **named)
         except (RuntimeError, MemoryError) as error:
             if backend.name == "cpu":
                 raise

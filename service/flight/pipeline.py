@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -69,7 +70,8 @@ def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperC
 
 
 class Pipeline:
-    """A scan's mapper, which reconstructs on the worker ``dense`` and keeps old surface on disk."""
+    """A scan's mapper, which reconstructs on the workers ``dense`` and ``placing`` and keeps old
+    surface on disk."""
 
     def __init__(
         self,
@@ -89,7 +91,7 @@ class Pipeline:
         limit_threads(config.compute.threads)
         self.stopwatch = Stopwatch()
         self._doubts: deque[str] = deque()  # found on the worker, taken by the operator's thread
-        row = None if config.scan.keep_debug else "dense"
+        rows = None if config.scan.keep_debug else ("dense", "placing")
         camera = with_shutter(camera, config.camera)
         self.mapper = Mapper(
             camera,
@@ -97,22 +99,23 @@ class Pipeline:
             backend,
             known,
             partial(PagedMap, folder=pages, max_voxels=config.compute.map_voxels),
-            partial(self._in_background, row, live),
+            partial(self._in_background, rows, live),
             self.stopwatch,
             keeps_cloud=False,
         )
         self.watch = GraphWatch(self.mapper.keyframes.graph)
 
     def _in_background(
-        self, row: str | None, live: bool, work: Reconstruct
+        self, rows: tuple[str, str] | None, live: bool, work: Reconstruct
     ) -> BackgroundWorker[StereoView, Reconstructed]:
-        watched = partial(self._watched, work)
-        self.worker = BackgroundWorker(row, watched, MAX_WAITING, live, counts)
+        self.worker = BackgroundWorker(
+            rows, lambda view: partial(self._watched, work(view)), MAX_WAITING, live, counts
+        )
         return self.worker
 
-    def _watched(self, work: Reconstruct, view: StereoView) -> Reconstructed:
-        """Do the work, and examine the graph now and then."""
-        update = work(view)
+    def _watched(self, place: Callable[[], Reconstructed]) -> Reconstructed:
+        """Place a view, and examine the graph now and then."""
+        update = place()
         self._doubts.extend(self.watch.look())
         return update
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
@@ -20,13 +21,25 @@ from recon.types import Camera
 from service.background import BackgroundWorker
 from service.flight.pipeline import counts
 
+ROWS = "dense", "placing"
+
+
+def halves(work: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """All the work in the first half."""
+
+    def first(item: Any) -> Callable[[], Any]:
+        made = work(item)
+        return lambda: made
+
+    return first
+
 
 def test_results_come_in_order_and_nothing_is_dropped() -> None:
     def work(n: int) -> int:
         time.sleep(0.002 * (n % 3))
         return n * n
 
-    jobs = BackgroundWorker("dense", work, 2)
+    jobs = BackgroundWorker(ROWS, halves(work), 2)
     out = []
     for n in range(30):
         jobs.offer(n)
@@ -36,6 +49,35 @@ def test_results_come_in_order_and_nothing_is_dropped() -> None:
     assert out == [(n, n * n) for n in range(30)] and jobs.dropped == 0
 
 
+def test_the_first_half_of_the_next_goes_on_beside_the_second() -> None:
+    began = [threading.Event() for _ in range(3)]
+
+    def work(n: int) -> Callable[[], bool]:
+        began[n].set()
+        return lambda: n == 2 or began[n + 1].wait(20)
+
+    jobs = BackgroundWorker(ROWS, work, 2)
+    for n in range(3):
+        jobs.offer(n)
+    assert jobs.finished(everything=True) == [(0, True), (1, True), (2, True)]
+    jobs.close()
+
+
+def test_a_fault_of_a_second_half_reaches_the_caller() -> None:
+    def work(n: int) -> Callable[[], float]:
+        return lambda: 1 / n
+
+    for rows in (ROWS, None):
+        jobs = BackgroundWorker(rows, work, 4)
+        for n in (2, 0, 4):
+            jobs.offer(n)
+        assert jobs.finished(everything=True) == [(2, 0.5)]
+        with pytest.raises(ZeroDivisionError):
+            jobs.finished(everything=True)
+        assert jobs.finished(everything=True) == [(4, 0.25)]
+        jobs.close()
+
+
 def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
     gate = threading.Event()
 
@@ -43,7 +85,7 @@ def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
         gate.wait(5)
         return n
 
-    jobs = BackgroundWorker("dense", work, 2, live=True)
+    jobs = BackgroundWorker(ROWS, halves(work), 2, live=True)
     for n in range(10):
         jobs.offer(n)
     gate.set()
@@ -58,7 +100,7 @@ def test_a_first_depth_that_gives_way_is_no_lost_view() -> None:
     def work(view: StereoView) -> None:
         gate.wait(5)
 
-    jobs = BackgroundWorker("dense", work, 2, live=True, counts=counts)
+    jobs = BackgroundWorker(ROWS, halves(work), 2, live=True, counts=counts)
     views = [view_at(seq, np.eye(4)) for seq in range(4)]
     first = replace(views[2], is_first_depth=True)
     for view in (views[0], first, *views[1:3]):  # no more than the queue takes but for the first
@@ -78,7 +120,7 @@ def test_live_what_gave_way_is_forgotten_while_the_work_at_hand_hangs() -> None:
 
     gate, items = threading.Event(), WeakSet[Item]()
     jobs: BackgroundWorker[Item, bool] = BackgroundWorker(
-        "dense", lambda _: gate.wait(5), 2, live=True
+        ROWS, halves(lambda _: gate.wait(5)), 2, live=True
     )
     for _ in range(50):
         item = Item()
@@ -96,7 +138,7 @@ def test_a_fault_reaches_the_caller() -> None:
     def work(n: int) -> int:
         raise RuntimeError("no luck")
 
-    jobs = BackgroundWorker("dense", work, 2)
+    jobs = BackgroundWorker(ROWS, halves(work), 2)
     jobs.offer(1)
     with pytest.raises(RuntimeError, match="no luck"):
         jobs.finished(everything=True)
@@ -109,7 +151,7 @@ def test_what_was_done_before_a_fault_is_not_lost() -> None:
             raise RuntimeError("no luck")
         return n
 
-    jobs = BackgroundWorker(None, work, 4)
+    jobs = BackgroundWorker(None, halves(work), 4)
     for n in range(5):
         jobs.offer(n)
     assert jobs.finished() == [(0, 0), (1, 1)]
@@ -120,18 +162,18 @@ def test_what_was_done_before_a_fault_is_not_lost() -> None:
 
 def test_without_a_thread_the_work_is_done_at_once() -> None:
     seen: list[int] = []
-    jobs: BackgroundWorker[int, None] = BackgroundWorker(None, seen.append, 2, live=True)
+    jobs: BackgroundWorker[int, None] = BackgroundWorker(None, halves(seen.append), 2, live=True)
     jobs.offer(1)
     assert seen == [1] and len(jobs.finished()) == 1
 
 
 def test_a_worker_that_is_not_closed_ends_with_its_owner() -> None:
-    jobs = BackgroundWorker("dense", str, 2)
+    jobs = BackgroundWorker(ROWS, halves(str), 2)
     jobs.offer(1)
     assert jobs.finished(everything=True) == [(1, "1")]
-    assert any(t.name == "dense" for t in threading.enumerate())
+    assert {t.name for t in threading.enumerate()}.issuperset(ROWS)
     del jobs
-    assert until(lambda: not any(t.name == "dense" for t in threading.enumerate()))
+    assert until(lambda: not any(t.name in ROWS for t in threading.enumerate()))
 
 
 def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
@@ -141,14 +183,14 @@ def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
     jobs: list[BackgroundWorker[int, int]] = []
 
     def worker(_: object) -> Any:
-        jobs.append(BackgroundWorker("dense", work, 2))
+        jobs.append(BackgroundWorker(ROWS, halves(work), 2))
         return jobs[-1]
 
     mapper: Any = Mapper(Camera(np.diag([60.0, 60.0, 1.0]), np.zeros(5), (80, 60)), worker=worker)
     mapper.views = Mock(VirtualStereoCamera, **{"ready.return_value": [1, 2, 3]})
     with pytest.raises(RuntimeError, match="no luck"):
         mapper.finish()
-    assert not any(t.name == "dense" for t in threading.enumerate())
+    assert not any(t.name in ROWS for t in threading.enumerate())
 
 
 def test_after_an_end_nothing_waits_for_work_that_lasts() -> None:
@@ -160,7 +202,7 @@ def test_after_an_end_nothing_waits_for_work_that_lasts() -> None:
             gate.wait(60)
         return n
 
-    jobs = BackgroundWorker("dense", work, 2)
+    jobs = BackgroundWorker(ROWS, halves(work), 2)
     jobs.end_by(end, patience_s=0.01)
     for n in range(9):  # the fifth would wait for the second
         jobs.offer(n)

@@ -9,7 +9,7 @@ import numpy as np
 from some_views import view_at
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
-from recon.pipeline.stages import plausible_depth
+from recon.pipeline.stages import PlausibleDepth
 from recon.pipeline.views import StereoView
 from recon.posegraph.segments import Segments
 from recon.stereo.reprojection import plausible
@@ -98,9 +98,12 @@ def test_nothing_left_is_no_depth() -> None:
 def test_a_segment_that_was_refuted_needs_more_views_that_agree() -> None:
     """Two views of a false motion contradict themselves; a third that does not stays out."""
     rejected, segments = Counter[str](), Segments()
+    plausible = PlausibleDepth(rejected)
 
     def stage(view: StereoView, depth: DepthMap) -> DepthMap | None:
-        return plausible_depth(view, depth, np.zeros((*SHAPE, 3), np.uint8), segments, rejected)
+        kept = plausible(view, depth, np.zeros((*SHAPE, 3), np.uint8))
+        segments[view.segment].agreement = plausible.agreement[view.segment]
+        return kept
 
     false, good = surface(np.zeros(SHAPE, np.uint8)), surface(np.full(SHAPE, 2, np.uint8))
     first, second = (view_at(n, np.eye(4), segment=n) for n in range(2))

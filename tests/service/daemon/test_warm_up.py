@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -134,7 +135,8 @@ def test_work_at_hand_is_timed() -> None:
         assert release.wait(20.0)
         return x
 
-    jobs: BackgroundWorker[int, int] = BackgroundWorker("dense", work, 3, live=True)
+    rows = "dense", "placing"
+    jobs = BackgroundWorker[int, int](rows, lambda x: partial(work, x), 3, live=True)
     assert jobs.busy_s == 0.0
     jobs.offer(1)
     assert begun.wait(20.0)
