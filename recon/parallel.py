@@ -7,6 +7,7 @@ compile each.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
@@ -69,12 +70,16 @@ def pool() -> ThreadPoolExecutor:
 
 
 def run_parallel(*calls: Callable[[], T]) -> list[T]:
-    """The results of independent calls that run at the same time."""
+    """The results of independent calls that run at the same time, begun in order."""
     results: list[Any] = [None] * len(calls)
+    rest = iter(enumerate(calls))  # each thread takes the next one
 
     def run(first: int, end: int) -> None:
-        for n in range(first, end):
-            results[n] = calls[n]()
+        try:
+            for n, call in rest:
+                results[n] = call()
+        finally:
+            deque(rest, maxlen=0)  # after a fault none begins
 
     parallel_for(run, len(calls))
     return results

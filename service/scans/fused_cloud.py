@@ -7,7 +7,8 @@ the keyframe that knows it best.
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, pairwise
@@ -106,7 +107,10 @@ def fused_cloud(
     edges = strip_edges(extents, min(strip_points, max(share, MIN_STRIP_POINTS)))
     with progress.part("fusing the cloud", 0.5):
         say = partial(progress.counting(len(extents)), progress.text)
-        strips = [_strip(store, extents, held, box, a, b, say) for a, b in pairwise(edges)]
+        within = [_inside(extents, *ends) for ends in pairwise(edges)]
+        uses = Counter(extent.seq for inside in within for extent in inside)
+        shares = {seq: uses[seq] * [held.pop(seq)] for seq in [*held]}
+        strips = [partial(_strip, store, inside, shares, box, say) for inside in within]
         keys, means = fuse_strips(strips, edges, size)
         release_memory()  # of the strips, before the whole is looked at
         cloud = without_contradicted(keys, means)
@@ -170,35 +174,27 @@ def strip_edges(extents: Iterable[Extent], max_points: int) -> list[float]:
     return [-np.inf, *(float(v) for v in inner), np.inf]
 
 
+def _inside(extents: Iterable[Extent], low_m: float, high_m: float) -> list[Extent]:
+    """Those that reach into a strip."""
+    margin = 1.0  # edges are moved by up to a voxel
+    return [e for e in extents if e.box[2] >= low_m - margin and e.box[0] <= high_m + margin]
+
+
 def _strip(
     store: Keyframes,
-    extents: list[Extent],
-    held: dict[int, PointCloud],
+    inside: Iterable[Extent],
+    shares: Mapping[int, list[PointCloud]],
     box: Box,
-    low_m: float,
-    high_m: float,
     say: Callable[[], None],
-) -> Callable[[], Iterator[PointCloud]]:
-    """The clouds of the keyframes that overlap a strip, ``held`` or read on demand.
-
-    What no strip to the east needs is no longer held; a strip to the west that has not come to it
-    yet reads it again.
-    """
-    margin = 1.0  # edges are moved by up to a voxel
-    inside = [e for e in extents if e.box[2] >= low_m - margin and e.box[0] <= high_m + margin]
-
-    def clouds() -> Iterator[PointCloud]:
-        for extent in inside:
-            say()
-            cloud = held.get(extent.seq)
-            if extent.box[2] < high_m - margin:
-                held.pop(extent.seq, None)
-            if cloud is not None:
-                yield cloud
-            elif (keyframe := store.keyframe(extent.seq)) is not None:
-                yield _points(keyframe, box)
-
-    return clouds
+) -> Iterator[PointCloud]:
+    """The clouds of the keyframes of a strip, read on demand, or one of the ``shares`` that each
+    strip has in those that are held."""
+    for extent in inside:
+        say()
+        if extent.seq in shares:
+            yield shares[extent.seq].pop()
+        elif (keyframe := store.keyframe(extent.seq)) is not None:
+            yield _points(keyframe, box)
 
 
 SCALE_M = 0.001
