@@ -181,7 +181,7 @@ def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:
 def test_every_name_of_the_library_is_there() -> None:
     assert all(getattr(recon, name) is not None for name in recon.__all__)
     with pytest.raises(AttributeError, match="nothing"):
-        recon.nothing  # noqa: B018  # type: ignore[attr-defined]
+        recon.nothing  # type: ignore[attr-defined]  # noqa: B018
 
 
 def test_the_library_needs_nothing_of_the_service() -> None:
