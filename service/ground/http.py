@@ -395,8 +395,8 @@ def _may_upload(request: Request) -> Response:
 
 async def _upload(request: Request) -> Response:
     """Import the body: files one after the other, each with its ``name`` and ``bytes``. A ZIP of a
-    scan folder, its scan.db or an MCAP becomes a scan at once; a video with its flight log in a
-    job (202). 409 while another import runs."""
+    scan folder, its scan.db or an MCAP becomes a scan at once; a video, with its flight log unless
+    that is inside, in a job (202). 409 while another import runs."""
     parts, state = _parts(request), state_of(request)
     note(request, "upload", names=[name for name, _ in parts])
     upload = await run_in_threadpool(Upload, state.library, parts)

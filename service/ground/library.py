@@ -256,8 +256,9 @@ class Library:
         try:
             with ScanStore.open(part / STORE_FILES[0]) as store:
                 header = store.header
-        except (sqlite3.Error, ValueError) as error:
-            raise InputError(f"{str(source)[:200]} contains no valid scan ({error})") from error
+        except (sqlite3.Error, ValueError, InputError) as error:
+            why = str(error).replace(f"{part}/", "")  # where it lies for a while
+            raise InputError(f"{str(source)[:200]} contains no valid scan ({why})") from error
         self._check_new(header, source)
         copy_files(source, part, ({*FILES, *OTHER_FILES} - {*STORE_FILES}))
         return header

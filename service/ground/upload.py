@@ -2,8 +2,8 @@
 
 The files stream to a folder of their own in the store, which is gone afterwards; the scan takes its
 place in one step. They are not a form: Starlette would first collect its parts in the system's
-temporary folder, which may have no room for 16 GiB. A recording (a video, its flight log, and
-perhaps its camera model) is replayed by a process of its own. Of an archive only the names of a
+temporary folder, which may have no room for 16 GiB. A recording (a video, and perhaps its flight
+log and camera model) is replayed by a process of its own. Of an archive only the names of a
 scan's files are unpacked, wherever they lie in it, so that no path in it is ever used.
 """
 
@@ -44,7 +44,11 @@ PARTS = {
 }
 """What a file is, by its suffix: a scan already, or of a recording the video or an option of
 ``replay``."""
-UPLOADS = (["scan"], ["--telemetry", "video"], ["--camera-model", "--telemetry", "video"])
+UPLOADS = (
+    ["scan"], ["video"], ["--telemetry", "video"], ["--camera-model", "video"],
+    ["--camera-model", "--telemetry", "video"],
+)  # fmt: skip
+"""A video alone may hold its telemetry."""
 Part = tuple[str, int]
 """Name and size in bytes of one uploaded file."""
 MAX_LISTING_BYTES = 4 << 20
@@ -68,7 +72,7 @@ def check_parts(library: Library, parts: Sequence[Part], room_bytes: int | None 
         names = ", ".join(name[:100] for name, _ in parts[:5])
         raise InputError(
             f"{names or 'nothing'} cannot be uploaded: give a ZIP of a scan folder, its scan.db, "
-            "an .mcap, or a video with its flight log"
+            "an .mcap, or a video with its flight log, unless that is inside"
         )
     for name, size in parts:
         if not 0 < size <= MAX_UPLOAD_BYTES:
@@ -99,8 +103,8 @@ class Upload:
 
     @property
     def is_recording(self) -> bool:
-        """Whether it is a video with its log, which :meth:`replay` makes a scan of."""
-        return len(self._paths) > 1
+        """Whether it is a video, which :meth:`replay` makes a scan of."""
+        return any(PARTS[path.suffix] == "video" for path in self._paths)
 
     @outside("the upload cannot be stored")
     def write(self, data: bytes) -> None:
@@ -170,7 +174,7 @@ class Upload:
 
 
 def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
-    """Make the scan folder ``out`` of a video, a log and perhaps a camera model.
+    """Make the scan folder ``out`` of a video and perhaps a log and a camera model.
 
     Raises InputError with the process's last line when it fails.
     """

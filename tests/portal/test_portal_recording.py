@@ -94,6 +94,8 @@ def test_a_recording_that_fails_or_is_cancelled_leaves_nothing(
     until(lambda: client.ask(f"/api/jobs/{second}", "DELETE")[0] == 200)
     assert ended(client, second)["state"] == "cancelled"
     until(lambda: not list(store.glob(".taking-*")))
-    for wrong in ((recording / "flight.mp4",), (*files, broken), (recording / "flight.tlog",)):
+    status, alone = send_recording(client, broken)  # it might hold its telemetry
+    assert status == 202 and ended(client, alone["number"])["state"] == "failed"
+    for wrong in ((*files, broken), (recording / "flight.tlog",)):
         assert send_recording(client, *wrong)[0] == 400
     assert not list(store.glob(".taking-*"))

@@ -114,7 +114,7 @@ def test_a_store_and_a_recording_become_scans(client: Client, store: Path, flown
 @pytest.mark.parametrize(
     ("name", "data", "said"),
     [
-        ("flight.mp4", b"x", "a video with its flight log"),
+        ("flight.tlog", b"x", "a video with its flight log"),
         ("a.zip", b"", "not 0 bytes"),
         ("a.zip", b"PK\3\4" + b"x" * 5000, "the ZIP cannot be read"),
         ("scan.db", b"no database" * 1000, "scan"),
@@ -254,7 +254,7 @@ def test_a_file_dropped_on_the_page_becomes_a_card(
     browser.wait("document.querySelector('.empty h2') !== null")
     archive = zipped(tmp_path / "a.zip", ("flight/scan.db", flown / "scan.db"))
     data = base64.b64encode(archive.read_bytes()).decode()
-    invited, opens, after = browser.run(DROP % (data, "flight.mp4"))
+    invited, opens, after = browser.run(DROP % (data, "flight.tlog"))
     assert "Drop" in invited and opens is False  # the browser does not open it
     assert after == ""
     browser.wait("document.querySelector('[role=alert]')?.textContent.includes('flight log')")

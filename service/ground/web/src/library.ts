@@ -146,7 +146,7 @@ function empty(filtered: boolean): HTMLElement {
     "div",
     { className: "empty" },
     el("h2", { textContent: "No scans yet" }),
-    el("p", { textContent: "They appear here as soon as a drone connects. Or upload (or drop here) a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log." }),
+    el("p", { textContent: "They appear here as soon as a drone connects. Or upload (or drop here) a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log, unless that is inside." }),
   );
 }
 
@@ -157,13 +157,17 @@ function importForm(again: () => void, upload: (files: FileList | null) => void)
   const close = (): void => void (box.open = false); // it would cover the jobs
   const act = el("button", {
     textContent: "Import",
-    onclick: () => (close(), void api.importFolder(folder.value).then(() => (again(), notify(`${folder.value} is imported`)), notify)),
+    onclick: () => {
+      const from = folder.value; // the next one may be written meanwhile
+      close();
+      void api.importFolder(from).then(() => (again(), notify(`${from} is imported`)), notify);
+    },
   });
   const chosen = el("input", { type: "file", multiple: true, hidden: true });
   chosen.onchange = () => (close(), upload(chosen.files));
   const send = el("button", {
     textContent: "Upload",
-    title: "a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log",
+    title: "a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log, unless that is inside",
     onclick: () => chosen.click(),
   });
   const menu = el("div", { className: "settings" }, el("p", {}, folder, act), el("p", {}, send, "or drop files on this page"), chosen);
