@@ -12,6 +12,7 @@ UTC of the day, ``time_s`` on any clock; without one, those of arrival.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,8 @@ from typing import Any
 
 from mavlink.wire.dialect import dialect
 
+log = logging.getLogger(__name__)
+
 MAX_LINES, LONGEST_LINE = 64, 512
 """Of a datagram; the rest is dropped."""
 
@@ -29,6 +32,8 @@ COLUMNS = (
     "hdop", "roll_deg", "pitch_deg", "yaw_deg", "gimbal_roll_deg", "gimbal_pitch_deg",
     "gimbal_yaw_deg",
 )  # fmt: skip
+HEADERS = ("lat_deg", "yaw_deg", "gimbal_yaw_deg")
+"""A header has one of them."""
 MAX_COLUMNS = 64
 
 SYSTEM, AUTOPILOT, GIMBAL = 1, 1, 154
@@ -47,6 +52,7 @@ class LineReader:
 
     def __init__(self) -> None:
         self._columns: Sequence[str] = ()
+        self._has_complained = False
         self._encoders = {n: dialect.MAVLink(None, SYSTEM, n) for n in (AUTOPILOT, GIMBAL)}
         self._beat_ns: int | None = None
         self._sigma: Values = {}  # of the last GST
@@ -70,10 +76,16 @@ class LineReader:
         if line.startswith("$"):
             return self._sentence(line)
         fields = [field.strip() for field in line.split(",", MAX_COLUMNS)[:MAX_COLUMNS]]
-        if "lat_deg" in fields or "yaw_deg" in fields or "gimbal_yaw_deg" in fields:
+        if any(name in fields for name in HEADERS):
             self._columns = fields
             return {}
         if len(fields) != len(self._columns):
+            if line and not self._has_complained:
+                self._has_complained = True
+                log.warning(
+                    "no telemetry in %.80r: neither NMEA nor CSV below a header with one of %s",
+                    line, ", ".join(HEADERS),
+                )  # fmt: skip
             return {}
         named = zip(self._columns, map(_number, fields), strict=True)
         return {name: value for name, value in named if name in COLUMNS and value == value}

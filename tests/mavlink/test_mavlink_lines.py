@@ -69,6 +69,14 @@ def test_lines_without_a_position_give_none(line: bytes) -> None:
     assert samples(LineReader().packets(line, S)) == []
 
 
+def test_a_header_with_other_names_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    reader = LineReader()
+    for _ in range(3):
+        assert reader.packets(b"lat,lon,alt\n47.1,8.2,400\n", S) == b""
+    (message,) = caplog.messages
+    assert "'lat,lon,alt'" in message and "lat_deg, yaw_deg, gimbal_yaw_deg" in message
+
+
 def test_cells_are_taken_by_name() -> None:
     reader = LineReader()
     reader.packets(b"note,gimbal_yaw_deg,lon_deg,lat_deg,relative_alt_m,gimbal_pitch_deg\n", S)
