@@ -79,6 +79,10 @@ class Lens:
         return Camera(K, np.array(self.distortion), size_px)
 
 
+CLOCKWISE = {"down": "left", "left": "up", "up": "right", "right": "down"}
+"""Where the rows of an image are read to once it is rotated clockwise by a quarter."""
+
+
 def turned(camera: Camera, clockwise_deg: int) -> Camera:
     """The camera of its image rotated clockwise by 0, 90, 180 or 270 degrees."""
     for _ in range(clockwise_deg // 90 % 4):
@@ -86,7 +90,10 @@ def turned(camera: Camera, clockwise_deg: int) -> Camera:
         k1, k2, p1, p2, k3 = camera.distortion
         quarter = [[K[1, 1], 0.0, H - 1 - K[1, 2]], [0.0, K[0, 0], K[0, 2]], [0.0, 0.0, 1.0]]
         bent = np.array([k1, k2, p2, -p1, k3])
-        camera = Camera(np.array(quarter), bent, (H, W), sigma_focal=camera.sigma_focal)
+        shutter = replace(camera.shutter, direction=CLOCKWISE[camera.shutter.direction])
+        camera = replace(
+            camera, K=np.array(quarter), distortion=bent, size_px=(H, W), shutter=shutter
+        )
     return camera
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -19,7 +20,7 @@ from typer.testing import CliRunner
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog
 from recon.camera_model import rays
-from recon.types import F64, U8, Camera
+from recon.types import DIRECTIONS, F64, U8, Camera, Shutter
 from service.cameras import open_camera
 from service.cameras.exif import read_tags
 from service.cameras.lens import SIGMA_FOCAL, Lens, by_view, fitted, reshaped, turned
@@ -194,6 +195,19 @@ def test_a_turned_camera_sees_the_same(clockwise_deg: int) -> None:
         u, v = seen.astype(np.float32).T[:, :, None]
         got = cv2.remap(source, u, v, cv2.INTER_LINEAR)
         assert np.abs(got[:, 0] - expected[:, axis]).max() < 0.05
+
+
+@pytest.mark.parametrize("clockwise_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_a_turned_camera_reads_its_rows_as_before(clockwise_deg: int, direction: str) -> None:
+    camera = replace(Lens(0.75).camera((4, 3)), shutter=Shutter(0.03, direction))
+    read_at = {"down": 0, "right": 1, "up": 2, "left": 3}[direction]
+    times = np.rot90(np.mgrid[0:9, 0:9][0], read_at)  # of rows of a square, by NumPy's turns
+    shutter = turned(camera, clockwise_deg).shutter
+    rate = np.gradient(np.rot90(times, -(clockwise_deg // 90)).astype(np.float64))
+    assert shutter.readout_s == 0.03
+    assert (rate[1 - shutter.axis] == shutter.sign).all()
+    assert not rate[shutter.axis].any()
 
 
 def images(size_px: tuple[int, int], turned_deg: int = 0) -> Any:
