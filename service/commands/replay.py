@@ -207,8 +207,9 @@ def fly(
 
     What came before that is wrong, so such a scan is discarded, unless it goes to the ground.
     """
+    from recon.parallel import pool
     from service.commands.missing_metadata import correction_of
-    from service.daemon.warm_up import has_kernels
+    from service.daemon.warm_up import has_kernels, load_kernels
     from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, create_store
     from service.memory import release_memory
@@ -224,6 +225,8 @@ def fly(
         work = "tracking and reconstructing"
         if not has_kernels():
             work = f"compiling kernels, once, a minute or two; {work}"
+        elif inputs.backend.name == "cpu":
+            pool().submit(load_kernels)  # the first view is some frames away
         with progress.part(work, of_rest=0.9):
             show = show_flown(inputs.source, progress)
             scan.run(stop, show, is_enough=lambda scan: correction_of(scan, unsure))
