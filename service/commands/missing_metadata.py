@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink.telemetry.history import HistoryConfig
 from mavlink.telemetry.logs import TelemetryLog, gpmf, klv, load_telemetry, srt
-from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig, corner_bend
 from recon.types import Camera
 from service.cameras import open_camera, parse_source
 from service.cameras.camera_file import seeks_readout
@@ -32,10 +31,10 @@ from service.cameras.video import metadata, subtitles
 from service.config import change
 from service.errors import InputError
 from service.flight.scan import Scan, ScanInputs, check_new, create_store
-from service.offline.refine.own_camera import MAX_SIGMA_BEND, MIN_IMAGES, bent, by_tags
 from service.stream.validity import MAX_TIME_NS, is_time
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a flight with a camera model does without calibration
+    from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
     from service.cameras.source import CameraSource
     from service.config import Config
     from service.progress import Progress
@@ -75,6 +74,8 @@ class StartLens:
 
 def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLens:
     """The lens by the images' tags, the log's focal length, or 70 degrees."""
+    from service.offline.refine.own_camera import bent, by_tags
+
     if isinstance(source, ImagesSource) and source.lens is not None and source.camera is not None:
         f, side, known = source.lens.focal, max(source.size_px), source.lens.is_calibrated
         note = f"taken from {source.lens.source} ({f * side:.0f} px)"
@@ -129,6 +130,7 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
     ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its camera
     source, a recording or a folder of stills.
     """
+    from service.offline.refine.own_camera import MIN_IMAGES
     from service.offline.refine.refinement import lens
 
     source, config = inputs.source, inputs.config
@@ -162,7 +164,10 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
 
 def still_assumed(found: SelfCalibrated) -> tuple[str, ...]:
     """What is as good as assumed of a lens that was found: its distortion, where depth at a corner
-    is bent by more than :data:`MAX_SIGMA_BEND`."""
+    is bent by more than MAX_SIGMA_BEND."""
+    from recon.calibration.flight import corner_bend
+    from service.offline.refine.own_camera import MAX_SIGMA_BEND
+
     bend = corner_bend(found.camera, found.sigma_k[0])
     return ("distortion",) if bend > MAX_SIGMA_BEND else ()
 

@@ -69,7 +69,6 @@ def replay(
         from service.cameras import open_camera, parse_source
         from service.cameras.camera_file import load_camera
         from service.cameras.source import Paced
-        from service.commands.adjusted_stills import adjusted_stills
         from service.commands.missing_metadata import (
             load_log,
             own_telemetry,
@@ -121,7 +120,9 @@ def replay(
                 inputs = with_own_lens(inputs, video, start, find, progress)
             if is_assumed:
                 inputs = replace(inputs, assumed=(*inputs.assumed, "start"))
-            if not realtime:
+            if not realtime and parse_source(video)[0] == "images":
+                from service.commands.adjusted_stills import adjusted_stills
+
                 inputs = adjusted_stills(inputs, is_latency_given, progress)
             summary = _corrected(inputs, video, unsure, progress)
     report(summary | {"scan_folder": str(folder)}, as_json)
