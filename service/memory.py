@@ -16,7 +16,7 @@ from contextlib import contextmanager
 
 M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1  # mallopt(3)
 
-POOLED_BYTES, SPARE_BYTES = 4 << 20, 8 << 20
+POOLED_BYTES, SPARE_BYTES = 8 << 20, 32 << 20
 """The largest allocation in the pool, and what it keeps at its end."""
 
 
