@@ -9,8 +9,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from recon.pipeline.interface import FramePosed, KeyframeReady, PosesChanged
-    from recon.pipeline.mapper import Mapper, MapperConfig
+    from recon.pipeline.mapper import (
+        FramePosed,
+        KeyframeReady,
+        Mapper,
+        MapperConfig,
+        PosesChanged,
+    )
     from recon.tracking.frame import Frame
     from recon.types import Camera, PointCloud, Pose, PosePrior
 
@@ -27,7 +32,7 @@ __all__ = [
     "PosesChanged",
 ]
 
-_ROOMS = ("recon.types", "recon.pipeline.interface", "recon.pipeline.mapper")
+_ROOMS = ("recon.types", "recon.pipeline.mapper")
 
 
 if not TYPE_CHECKING:  # a type checker refuses names that are not there

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
 
@@ -21,29 +21,21 @@ from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.mapping.voxel_map import VoxelMap, ground_sample_m
 from recon.pipeline.frame_poses import FramePoses
-from recon.pipeline.interface import (
-    Event,
-    FramePosed,
-    KeyframeReady,
-    MapperConfig,
-    PosesChanged,
-    Timing,
-    check_image,
-    check_prior,
-    untimed,
-)
-from recon.pipeline.keyframe_map import KeyframeMap
+from recon.pipeline.keyframe_map import KeyframeMap, SurfaceMap
 from recon.pipeline.stages import (
     DenseStereo,
     PlausibleDepth,
+    Timing,
     Undistort,
+    check_image,
     keyframe_of,
+    untimed,
     without_false_surface,
 )
-from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import StereoView, ViewSelection, VirtualStereoCamera
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.pose_priors import check_prior
 from recon.posegraph.trajectory import Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
@@ -54,7 +46,61 @@ from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
 from recon.types import U8, Array, Camera, DepthMap, Keyframe, PointCloud, Pose, PosePrior
 
-__all__ = ["Mapper", "MapperConfig"]
+
+@dataclass(frozen=True, slots=True)
+class MapperConfig:
+    """Parameters of a :class:`Mapper`."""
+
+    # A view each so many metres along the track, or frames; by base to height where both are 0.
+    spacing_m: float = 0.0
+    spacing_frames: int = 0
+    pairs: int = 4  # partners of a view, at most
+    base_to_height: float = 0.1  # motion between the odometry's keyframes over the distance
+    seeks_readout: bool = False  # the shutter's readout is a start, to be found by the images
+    guide_width_px: int = 1280  # of the images that guide the upsampling
+    stereo_width_px: int = 320
+    upsample: bool = True
+    labels: int = 16  # of disparity, at least
+    iterations: int = 5  # of belief propagation per level
+    loops: bool = True
+    loop_views: int = 400  # keyframes kept for loop detection
+    graph_keyframes: int = 400  # nodes of the pose graph; above that, keyframes are interpolated
+    resolution_m: float = 0.0  # of the map, at least; 0: as fine as the images
+    keeps_debug: bool = False  # the images of each view's stages
+    first_depths: bool = False  # of views whose partners have not come, while no work waits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePosed:
+    """A frame went through tracking. One that was lost comes again where the next one places it."""
+
+    frame: Frame  # without its images; gives its pose in the odometry again, as known later
+    pose: Pose | None = None  # in the world; by telemetry alone when vision fails
+    is_view: bool = False  # the frame takes part in stereo and may become a keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeReady:
+    """A view has become a keyframe, with the depth of all its partners.
+
+    ``is_first_depth``: only what one partner shows, to look at now. The same view comes again with
+    its whole depth, unless it is refused. ``stages``: the images of its stages, by name, where they
+    are kept.
+    """
+
+    keyframe: Keyframe
+    is_first_depth: bool = False
+    stages: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosesChanged:
+    """Better poses of keyframes that came before, by number."""
+
+    poses: Mapping[int, Pose]
+
+
+Event = FramePosed | KeyframeReady | PosesChanged
 
 Reconstructed = tuple[Pose | None, tuple[Event, ...]]
 """The pose of a view that is in the graph now, None of one that comes again after its first depth;

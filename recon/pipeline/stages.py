@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import cv2
@@ -13,14 +14,13 @@ from recon import se3
 from recon.backends import Backend, DenseStages
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
-from recon.pipeline.interface import CONTRADICTED, Timing
 from recon.pipeline.views import StereoView
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import PairDepth, carry, fuse, label_noise, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
-from recon.tracking.frame import NO_IMAGE, Frame
+from recon.tracking.frame import CONTRADICTED, NO_IMAGE, Frame
 from recon.tracking.matching import build_pyramid
 from recon.types import (
     F32,
@@ -38,8 +38,24 @@ from recon.types import (
     StereoPair,
 )
 
+Timing = Callable[[str], AbstractContextManager[object]]
+"""Gives a stage by name the context that it runs in."""
+
+
+def untimed(stage: str) -> AbstractContextManager[object]:
+    return nullcontext()
+
+
 MAX_TRACKING_WIDTH_PX = 1280
 """Wider images are made smaller for tracking, whose time grows with their area."""
+
+
+def check_image(image: U8, size_px: tuple[int, int]) -> None:
+    """Raise ValueError, naming the fault, unless the image is (H, W, 3) uint8 of ``size_px``."""
+    wanted = (size_px[1], size_px[0], 3)
+    if not isinstance(image, np.ndarray) or image.shape != wanted or image.dtype != np.uint8:
+        given = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else repr(image)
+        raise ValueError(f"the image must be BGR, {wanted} uint8 by the camera model, not {given}")
 
 
 class Undistort:

@@ -34,6 +34,27 @@ def has_fix(prior: PosePrior) -> bool:
     return prior.position_m is not None and prior.sigma_position_m is not None
 
 
+def check_prior(prior: PosePrior) -> None:
+    """Raise ValueError, naming the field, where a part of the prior is none that can be."""
+    if not isinstance(prior, PosePrior):
+        raise ValueError(f"the prior must be a PosePrior, not {prior!r}; leave it out for none")
+    R = prior.R_world_camera
+    if R is not None and not (
+        _is_finite(R, (3, 3))
+        and np.allclose(R @ R.T, np.eye(3), atol=1e-3)
+        and np.linalg.det(R) > 0.0
+    ):
+        raise ValueError(f"R_world_camera must be a (3, 3) rotation, or None, not {R!r}")
+    for name in ("position_m", "sigma_position_m", "velocity_m_s", "turn_rad_s"):
+        value = getattr(prior, name)
+        if value is not None and not _is_finite(value, (3,)):
+            raise ValueError(f"{name} must be an array of 3 numbers, or None, not {value!r}")
+
+
+def _is_finite(value: object, shape: tuple[int, ...]) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == shape and bool(np.isfinite(value).all())
+
+
 def sound(prior: PosePrior) -> PosePrior:
     """The prior without readings that are not finite, and no sigma below what a sensor reaches."""
     R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m

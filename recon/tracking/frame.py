@@ -18,6 +18,13 @@ NOWHERE, NO_SPREAD = np.full((4, 4), np.nan), np.zeros((6, 6))
 UNKNOWN = PosePrior()
 
 
+TWO_ONLY = "seen by two views only"
+"""Reason why a view is refused: nothing confirms its one pair."""
+
+CONTRADICTED = "pairs contradict each other"
+"""Another: its pairs, or those of most views before it, do not agree on a surface."""
+
+
 class Tracking(str, Enum):
     STARTED = "started"  # first of a segment
     WAITING = "waiting"  # the camera has not moved enough for a second view

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from recon.backends import Backend
 from recon.parallel import limit_threads
-from recon.pipeline.interface import MapperConfig
-from recon.pipeline.mapper import Mapper, Reconstruct, Reconstructed
+from recon.pipeline.mapper import Mapper, MapperConfig, Reconstruct, Reconstructed
 from recon.pipeline.views import StereoView
 from recon.tracking.adjusted_track import AdjustedTrack
 from recon.types import Camera

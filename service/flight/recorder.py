@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter
+import tempfile
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -15,20 +16,19 @@ import numpy as np
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.pipeline.frame_poses import pose_at
-from recon.pipeline.interface import Event, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.mapper import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.ground import GUESSED_SHARE
 from recon.poses import sigma_m
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Keyframe, Pose
 from service.cameras.rig import Rig, attitude_of
+from service.errors import OutsideError
 from service.flight.pipeline import Pipeline
-from service.flight.published_frames import FRAME, PublishedFrames
 from service.flight.reports import FOUND, gnss_over_heights, graph_figures, sigma_of_scale
 from service.scans.drawing import save_debug
 from service.scans.track import cell, seconds_text
 from service.scans.trust import FIRST_TELEMETRY
-from service.stream.codec import encode
-from service.stream.images import IMAGE_SHARE, encode_image
+from service.stream.codec import IMAGE_SHARE, encode, encode_image
 from service.stream.records import PoseRecord, Repose
 from service.stream.store import ScanStore
 
@@ -39,6 +39,63 @@ ground from 50 m), or its sigma changed by more than this share."""
 BATCH, REPLAYED = 256, 16
 """Poses in one transaction, which takes a synchronised write of the disk: those written again in
 the end, and those of a recording, which can be replayed."""
+
+
+FRAME = np.dtype(
+    [
+        ("time_ns", np.int64),  # unix
+        ("seq", np.int64),
+        ("segment", np.int32),
+        ("T_odom_camera", np.float64, (4, 4)),
+        ("T_world_camera", np.float64, (4, 4)),  # as written, as all below
+        ("sigma_m", np.float64),
+        ("agl_m", np.float64),  # NaN: unknown
+        ("is_view", np.bool_),
+    ]
+)
+"""A row of the file: one frame."""
+
+
+class PublishedFrames:
+    """Published poses of the frames that refer to a keyframe, in order; on the disk but for the
+    newest.
+
+    The file has no name and is gone with the process.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._fresh: deque[tuple[Frame, Any]] = deque()
+        self._file = tempfile.TemporaryFile(dir=folder, buffering=1 << 16)  # noqa: SIM115
+
+    def add(self, frame: Frame, row: Any, is_settled: Callable[[Frame], bool]) -> None:
+        """Take the next frame's row of :data:`FRAME` but for what the ``frame`` knows; those whose
+        keyframes no longer change go to the disk.
+
+        Raises OutsideError when the disk takes no more.
+        """
+        self._fresh.append((frame, row))
+        while self._fresh and is_settled(self._fresh[0][0]):
+            try:
+                self._file.write(_whole(*self._fresh.popleft()).tobytes())
+            except OSError as error:
+                why = f"poses cannot be stored for the scan: {error.strerror}"
+                raise OutsideError(why) from error
+
+    def rows(self) -> Iterator[Any]:
+        """The rows of all frames, in order."""
+        self._file.seek(0)
+        while row := self._file.read(FRAME.itemsize):
+            yield np.frombuffer(row, FRAME)[0]
+        yield from (_whole(*one) for one in self._fresh)
+
+    def close(self) -> None:
+        """Release the file."""
+        self._file.close()
+
+
+def _whole(frame: Frame, row: Any) -> Any:
+    row["seq"], row["segment"], row["T_odom_camera"] = frame.seq, frame.segment, frame.T_odom_camera
+    return row
 
 
 class Recorder:

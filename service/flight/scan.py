@@ -19,8 +19,8 @@ from typing import Any
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
-from recon.pipeline.interface import Event as MapperEvent
-from recon.pipeline.interface import FramePosed
+from recon.pipeline.mapper import Event as MapperEvent
+from recon.pipeline.mapper import FramePosed
 from recon.posegraph.pose_priors import VelocityIntegrator
 from recon.tracking.adjusted_track import AdjustedTrack
 from recon.tracking.frame import Frame

@@ -14,7 +14,7 @@ from mavlink.component.status import BodyOdometry
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
-from recon.pipeline.interface import FramePosed
+from recon.pipeline.mapper import FramePosed
 from recon.types import F64, Camera
 from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig

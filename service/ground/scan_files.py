@@ -32,7 +32,7 @@ from service.offline.refine.refly import (
 )
 from service.scans.main_piece import main_track
 from service.scans.track import local_frame
-from service.stream.images import whole_bgr
+from service.stream.codec import whole_bgr
 from service.stream.planes import image_size
 from service.stream.store import ScanStore
 

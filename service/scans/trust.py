@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.pipeline.interface import CONTRADICTED, TWO_ONLY
 from recon.plane import plane_through
+from recon.tracking.frame import CONTRADICTED, TWO_ONLY
 from recon.types import F32, F64, Array
 from service.scans.main_piece import main_track
 from service.stream.records import PoseRecord

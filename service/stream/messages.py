@@ -17,7 +17,7 @@ from typing import Annotated, TypeVar
 import msgspec
 from msgspec import Meta
 
-from service.stream.images import MAX_IMAGE_BYTES
+from service.stream.codec import MAX_IMAGE_BYTES
 from service.stream.naming import MAX_NAME, NAME
 from service.stream.ranges import RangeSet, ranges_from_pairs
 from service.stream.validity import MAX_HEADER_BYTES, MAX_SUMMARY_BYTES

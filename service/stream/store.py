@@ -33,7 +33,6 @@ from service.stream.database import (
     peek_meta,
     rescue,
 )
-from service.stream.images import is_image
 from service.stream.radio_tiles import RadioStore
 from service.stream.ranges import (
     MAX_NUMBER,
@@ -250,7 +249,7 @@ class ScanStore:
     def image(self, seq: int) -> bytes | None:
         """The JPEG of the whole keyframe ``seq``; None in scans without."""
         data = self.chunk(seq, codec.IMAGE_LAYER)
-        return data if data is not None and is_image(data) else None
+        return data if data is not None and codec.is_image(data) else None
 
     def keyframe(self, seq: int) -> Keyframe | None:
         """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
@@ -536,6 +535,6 @@ def _chunk_row(data: bytes) -> tuple[Any, ...] | None:
 
 def _image_row(seq: int, data: bytes) -> tuple[Any, ...] | None:
     """A keyframe's image in the table of layers, which states its time; None for invalid bytes."""
-    if not is_image(data):
+    if not codec.is_image(data):
         return None
     return seq, codec.IMAGE_LAYER, 0, 0, zlib.crc32(data), time.time_ns(), data

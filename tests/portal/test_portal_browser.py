@@ -26,8 +26,7 @@ from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.folder import write_deliverables
-from service.stream.codec import encode
-from service.stream.images import encode_image
+from service.stream.codec import encode, encode_image
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from recon.pipeline.interface import Event, KeyframeReady
+from recon.pipeline.mapper import Event, KeyframeReady
 from recon.types import Keyframe
 
 

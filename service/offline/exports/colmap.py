@@ -25,7 +25,7 @@ from service.offline.refine.own_camera import sightings
 from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
 from service.scans.writing import writing_folder
-from service.stream.images import whole_bgr
+from service.stream.codec import whole_bgr
 
 JPEG_QUALITY = 95
 

@@ -31,7 +31,7 @@ from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import needing
 from service.scans.track import camera_of
 from service.scans.writing import writing
-from service.stream.images import whole_bgr
+from service.stream.codec import whole_bgr
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 

@@ -24,7 +24,7 @@ from service.offline.exports.recording import POINT, in_order, jpeg, known_point
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
-from service.stream.images import whole_bgr
+from service.stream.codec import whole_bgr
 from service.stream.records import PoseRecord
 
 MAX_STAMP_NS = (1 << 31) * 10**9 - 1

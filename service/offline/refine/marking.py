@@ -33,7 +33,7 @@ from service.offline.refine.control_points import (
 from service.offline.refine.revisions import NEWEST, Revisions
 from service.offline.refine.survey_file import Sighting, SurveyPoint, SurveyRow, read_survey
 from service.scans.track import camera_of, local_frame
-from service.stream.images import whole_bgr
+from service.stream.codec import whole_bgr
 from service.stream.store import ScanStore
 
 GCP = "gcp.csv"

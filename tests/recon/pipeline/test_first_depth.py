@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from painted_ground import CAMERA, HEIGHT_M, pose, still
 
-from recon.pipeline.interface import Event, KeyframeReady, PosesChanged
-from recon.pipeline.mapper import Mapper, MapperConfig
+from recon.pipeline.mapper import Event, KeyframeReady, Mapper, MapperConfig, PosesChanged
 from recon.tracking.frame import Frame
 from recon.types import F64, PosePrior
 from service.config import load_config

@@ -13,8 +13,8 @@ from some_views import keyframe_at, view_at
 from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.pipeline.frame_poses import FramePoses, pose_at
-from recon.pipeline.interface import untimed
 from recon.pipeline.keyframe_map import KeyframeMap
+from recon.pipeline.stages import untimed
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import sigma_m

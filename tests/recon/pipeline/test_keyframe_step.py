@@ -12,8 +12,8 @@ from some_views import view_at
 
 from recon import se3
 from recon.backends import Backend
-from recon.pipeline.interface import untimed
 from recon.pipeline.keyframe_map import KeyframeMap
+from recon.pipeline.stages import untimed
 from recon.posegraph.trajectory import Trajectory
 from recon.types import DepthMap, Registration, Verdict
 

@@ -16,8 +16,15 @@ from some_views import view_at
 
 import recon
 from recon import se3
-from recon.pipeline.interface import FramePosed, KeyframeReady, PosesChanged
-from recon.pipeline.mapper import Mapper, MapperConfig, Reconstructed, moved
+from recon.pipeline.mapper import (
+    FramePosed,
+    KeyframeReady,
+    Mapper,
+    MapperConfig,
+    PosesChanged,
+    Reconstructed,
+    moved,
+)
 from recon.pipeline.views import StereoView, ViewSelection
 from recon.tracking.frame import Frame, Tracking
 from recon.types import Camera, DepthMap, Keyframe, Pose, PosePrior

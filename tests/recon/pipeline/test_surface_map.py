@@ -12,7 +12,7 @@ from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.mapping.disagreement import MIN_FACTOR
 from recon.mapping.voxel_map import VoxelMap, tiles_under
-from recon.pipeline.surface_map import SurfaceMap
+from recon.pipeline.keyframe_map import SurfaceMap
 from recon.pipeline.views import KNOWN_ROWS
 from recon.types import F64, Camera, DepthMap, PosePrior
 from service.config import load_config

@@ -13,8 +13,8 @@ from some_views import view_at
 from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
-from recon.pipeline.interface import untimed
 from recon.pipeline.keyframe_map import KeyframeMap
+from recon.pipeline.stages import untimed
 from recon.posegraph.ground import (
     ASSUMED_TILT_RAD,
     LEVEL_SIGMA_RAD,

@@ -13,8 +13,7 @@ from some_views import view_at
 
 from recon.backends import DenseStages
 from recon.backends.cpu import CpuBackend
-from recon.pipeline.interface import untimed
-from recon.pipeline.stages import DenseStereo
+from recon.pipeline.stages import DenseStereo, untimed
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import (

@@ -16,7 +16,7 @@ from tracked_frame import undistorted
 
 from recon.backends import load_backend
 from recon.camera_model import scaled
-from recon.pipeline.interface import Event, FramePosed
+from recon.pipeline.mapper import Event, FramePosed
 from recon.tracking.frame import Frame, Tracking
 from recon.tracking.localisation import Localiser, Located, Start
 from recon.tracking.odometry import Odometry

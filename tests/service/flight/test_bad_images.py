@@ -18,7 +18,7 @@ from mapper_events import keyframes_of
 from mavlink.telemetry.samples import VehicleState
 from recon import parallel, se3
 from recon.backends import load_backend
-from recon.pipeline.interface import FramePosed
+from recon.pipeline.mapper import FramePosed
 from recon.tracking.frame import Frame
 from recon.types import F64, U8, Camera, Keyframe
 from service.cameras.rig import Rig

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recon.backends.cpu import CpuBackend
-from recon.pipeline.interface import FramePosed
+from recon.pipeline.mapper import FramePosed
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import U8, Camera
 from service.cameras.source import CameraFrame, CameraSource, ahead

@@ -15,7 +15,7 @@ from recon import se3
 from recon.tracking.frame import NO_IMAGE, Frame
 from recon.types import F64
 from service.errors import OutsideError
-from service.flight.published_frames import FRAME, PublishedFrames
+from service.flight.recorder import FRAME, PublishedFrames
 
 RNG = np.random.default_rng(4)
 

@@ -16,7 +16,7 @@ from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import PositionSample
 from recon import se3
 from recon.camera_model import scaled_K
-from recon.pipeline.interface import FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.mapper import FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.alignment import Scale
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.pose_graph import PoseGraph
@@ -28,7 +28,7 @@ from service.cameras.rig import Rig
 from service.cameras.source import CameraFrame
 from service.flight.recorder import REPLAYED, Recorder
 from service.scans.drawing import debug_path, load_debug
-from service.stream.images import IMAGE_SHARE
+from service.stream.codec import IMAGE_SHARE
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
 

@@ -21,7 +21,7 @@ from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
-from recon.pipeline.interface import FramePosed
+from recon.pipeline.mapper import FramePosed
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Camera, Pose
 from service.config import CameraConfig, load_config

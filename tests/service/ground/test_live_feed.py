@@ -15,7 +15,7 @@ from spied import spied
 
 from service.ground.live import LiveFeed
 from service.stream import codec, radio_messages, store
-from service.stream.images import encode_image
+from service.stream.codec import encode_image
 from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose
 from service.stream.store import ScanStore
 

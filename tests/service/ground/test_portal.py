@@ -30,8 +30,7 @@ from service.ground.state import KINDS
 from service.ground.vehicle import Vehicle
 from service.listener import parse_address
 from service.stream import codec, plane_coders, planes
-from service.stream.codec import encode
-from service.stream.images import encode_image
+from service.stream.codec import encode, encode_image
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
 

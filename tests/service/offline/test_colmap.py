@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from recon import se3
 from service.errors import InputError
 from service.offline.exports.view import ExportOptions, ScanView, export
-from service.stream.images import encode_image, whole_bgr
+from service.stream.codec import encode_image, whole_bgr
 from service.stream.store import ScanStore
 
 

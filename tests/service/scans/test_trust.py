@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.pipeline.interface import CONTRADICTED, TWO_ONLY
+from recon.tracking.frame import CONTRADICTED, TWO_ONLY
 from service.scans.trust import BY_SURVEY, depth_share, slope_deg, trust_of
 
 SURE: dict[str, Any] = {

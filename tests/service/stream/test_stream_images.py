@@ -12,8 +12,14 @@ import pytest
 
 from recon.types import U8
 from service.ground.intake import SMALL, ScanIntake
-from service.stream.codec import encode
-from service.stream.images import MAX_IMAGE_BYTES, STEPS, encode_image, is_image, whole_bgr
+from service.stream.codec import (
+    IMAGE_STEPS,
+    MAX_IMAGE_BYTES,
+    encode,
+    encode_image,
+    is_image,
+    whole_bgr,
+)
 from service.stream.messages import Head, Held, parse, split
 from service.stream.outbox import Outbox, Outgoing
 from service.stream.ranges import RangeSet
@@ -66,7 +72,7 @@ def test_images_of_any_shape(house: HouseFlight, w: int, h: int) -> None:
     data = encode_image(np.zeros((h, w, 3), np.uint8), 1e9)
     assert is_image(data)
     shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert shown is not None and max(shown.shape) <= STEPS[0][0]
+    assert shown is not None and max(shown.shape) <= IMAGE_STEPS[0][0]
     one = house.keyframe(0, 0.0)
     assert whole_bgr(one, data).shape == one.bgr.shape
 
