@@ -44,7 +44,8 @@ HUBER = 2.5
 """Whitened residuals beyond this lose weight."""
 
 WILD = 12.5
-"""Fixes and attitudes beyond this are left out once the fit stands, if fewer than half are."""
+"""Beyond this, and beyond twice the median, what a reading pulls falls by the square of its
+residual (redescending, as Hampel's): it is no noise. From a wrong start all residuals are large."""
 
 ODD = 5.0
 """The same of a fix against those next to it."""
@@ -56,7 +57,7 @@ SETTLED_START = 0.1
 """The same for a fit that only starts another one, or whose residuals give the noise."""
 
 ITERATIONS = 30
-"""Steps of a fit before it must stand; ten more may follow without what is wild."""
+"""Steps of a fit, at most."""
 
 ROUNDS = 4
 """Times that the noise of altitudes and the tilt by them are found in turn."""
@@ -135,8 +136,7 @@ def fit(
 
 def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
     """(7, 7) of a solution, larger where fixes differ by more than their noise."""
-    excess = readings.excess(found.residuals, found.kept)
-    return np.asarray(np.linalg.inv(found.H)[:7, :7] * max(excess, 1.0), np.float64)
+    return np.asarray(np.linalg.inv(found.H)[:7, :7] * max(found.excess, 1.0), np.float64)
 
 
 def _measured(
@@ -262,25 +262,23 @@ class _Solution:
     at: Alignment
     H: F64
     cost: float
-    residuals: F64  # (M,) whitened, of the readings
-    kept: F64  # (groups,) 0 for what is left out
+    excess: float  # variance factor of the fixes: 1 where they differ as their noise says
 
 
 def _solve(readings: AlignmentReadings, at: Alignment, settled: float) -> _Solution:
-    """Gauss-Newton with Huber's weights, until a step of ``settled`` sigmas."""
-    group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
+    """Gauss-Newton with robust weights, until a step of ``settled`` sigmas."""
     H, cost, extra = np.eye(UNKNOWNS), np.inf, np.zeros((2, len(readings.fix)))
-    weight = kept
     ridge = np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
-    for i in range(ITERATIONS + 10):
+    for _ in range(ITERATIONS):
         parallel.release_gil()
         r, J = readings.linearised(at)
-        norms = np.sqrt(np.bincount(group, weights=r**2, minlength=len(kept)))
+        norms = np.sqrt(np.bincount(readings.group, weights=r**2))
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
         known = readings.information(extra)
         alone, fixes = readings.alone(r, known, extra), norms[readings.of_fixes]
         np.maximum(fixes, alone * np.where(alone > ODD, WILD / ODD, 1.0), out=fixes)
-        weight = kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))
+        wild, norms = max(WILD, 2.0 * float(np.median(norms))), np.maximum(norms, 1e-9)
+        weight = np.minimum(1.0, HUBER / norms) * np.minimum(1.0, wild / norms) ** 2
         W = readings.weighted(np.column_stack([J, r]), weight, known)
         extra = readings.doubted(known, extra, weight)
         H, g = J.T @ W[:, :-1] + ridge, J.T @ W[:, -1]
@@ -288,10 +286,10 @@ def _solve(readings: AlignmentReadings, at: Alignment, settled: float) -> _Solut
         step[:3] = np.clip(step[:3], -0.5, 0.5)
         step[6:10] = np.clip(step[6:10], -0.5, 0.5)
         at = at.moved(step)
-        stands = step @ H @ step < settled**2 or i >= ITERATIONS - 1
-        if stands and not (kept.all() and _leave_out(readings, norms, kept)):
+        if step @ H @ step < settled**2:
             break
-    return _Solution(_centred(readings, at, weight), H, cost, r, kept)
+    excess = readings.excess(r, W[:, -1], norms < wild)
+    return _Solution(_centred(readings, at, weight), H, cost, excess)
 
 
 def _centred(readings: AlignmentReadings, at: Alignment, weight: F64) -> Alignment:
@@ -301,16 +299,6 @@ def _centred(readings: AlignmentReadings, at: Alignment, weight: F64) -> Alignme
         return at
     each = weight[readings.of_fixes, None] / readings.sigma_fix**2
     return replace(at, t=at.t - np.average(readings.placed(at), axis=0, weights=each))
-
-
-def _leave_out(readings: AlignmentReadings, norms: F64, kept: F64) -> bool:
-    """True when attitudes or fixes are wild and now out of ``kept``: fewer than half of them."""
-    n, m = len(readings.R_odom), len(readings.fix)
-    for kind in (slice(0, n), slice(n, n + m)):
-        wild = norms[kind] > WILD
-        if 2 * wild.sum() < len(wild):
-            kept[kind][wild] = 0.0
-    return not kept.all()
 
 
 def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[Alignment]:

@@ -19,7 +19,7 @@ from recon.posegraph.pose_priors import MIN_FIX_M, has_fix, off_attitudes
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S, Noise, bias_time_constant_s, inflation
 from recon.similarity import Similarity
-from recon.types import F64, PosePrior
+from recon.types import F64, Bool, PosePrior
 
 BIAS_SHARE = 0.6
 """Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""
@@ -309,12 +309,10 @@ class AlignmentReadings:
         ways = sigma * rows.reshape(len(sigma), 3 * rows.shape[1])
         return (sigma * self._slow.weighted(self.way_end_s, own, ways)).reshape(rows.shape)
 
-    def excess(self, r: F64, kept: F64) -> float:
-        """Variance factor of the fixes: 1 where their residuals (M,) are as their noise says."""
-        none = np.zeros((2, len(self.fix)))
-        known = self.information(self.doubted(self.information(none), none, kept))
-        free = 3.0 * float(np.sum(kept[self.of_fixes])) - 7.0
-        weighted = self.weighted(r[:, None], kept, known)[:, 0]
+    def excess(self, r: F64, weighted: F64, kept: Bool) -> float:
+        """Variance factor of the fixes by residuals (M,), the same ``weighted``, and which groups
+        are ``kept``: 1 where they are as their noise says."""
+        free = 3.0 * np.count_nonzero(kept[self.of_fixes]) - 7.0
         return float(r[self._rows] @ weighted[self._rows]) / max(free, 1.0)
 
     def placed(self, at: Alignment) -> F64:

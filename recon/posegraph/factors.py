@@ -116,7 +116,7 @@ class GraphFactors:
         used |= {"attitude"} if self._attitude(node, T, spread) else set()
         if segment.similarity is not None:
             used |= {"gnss"} if self._position(node, T, spread) else set()
-            has_altitude, has_height = self._altitude(node, T), self._height(node)
+            has_altitude, has_height = self._altitude(node, T, spread), self._height(node)
             used |= {"altitude"} if has_altitude or has_height else set()
         self.sources.append(used)
 
@@ -293,7 +293,7 @@ class GraphFactors:
         self.smoother.add_place("position", node.key, prior.position_m, sigma, HUBER_SIGMAS)
         return True
 
-    def _altitude(self, node: Node, T: F64) -> bool:
+    def _altitude(self, node: Node, T: F64, spread: F64) -> bool:
         """The altitude minus its offset; after a step it continues from the track."""
         prior = node.prior
         if prior.altitude_m is None:
@@ -301,7 +301,8 @@ class GraphFactors:
         if self._altitude_offset_m is None:
             self._altitude_offset_m = prior.altitude_m - T[2, 3]
         z, one = prior.altitude_m - self._altitude_offset_m, prior.sigma_altitude_m
-        if abs(z - T[2, 3]) > GATE_SIGMAS * one + ALTITUDE_SLACK_M:
+        sure = se3.about(T[:3, 3], spread)[5, 5]
+        if abs(z - T[2, 3]) > GATE_SIGMAS * np.sqrt(sure + one**2) + ALTITUDE_SLACK_M:
             self.left_out["altitude off"] += 1
             self._altitude_offset_m = prior.altitude_m - T[2, 3]
             return False

@@ -93,7 +93,7 @@ class PoseGraph:
         last = self._newest() if self._nodes else None
         self.entered += 1
         self._nodes[node.seq] = node
-        is_refitted = self.segments.refit(self.segments.add(node), self._smoother.pose)
+        is_refitted = self.segments.refit(self.segments.add(node))
         if len(self) >= self._thin_at:
             self._thin()
         elif is_refitted:
@@ -140,7 +140,7 @@ class PoseGraph:
         """Fit every segment's frame to all its telemetry again, and rebuild the graph."""
         for segment in self.segments:
             segment.forget()
-            self.segments.refit(segment, self._smoother.pose)
+            self.segments.refit(segment)
             loops = [one for one in self.loops if self._enters(one, segment.number)]
             if loops and not segment.is_tied:
                 self.rebuild()  # so that the segments before are where they belong

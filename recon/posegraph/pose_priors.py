@@ -59,6 +59,7 @@ def sound(prior: PosePrior) -> PosePrior:
     """The prior without readings that are not finite, and no sigma below what a sensor reaches."""
     R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
     has_turn = _are_finite(R, prior.sigma_tilt_rad, prior.sigma_yaw_rad)
+    has_turn &= min(prior.sigma_tilt_rad, prior.sigma_yaw_rad) > 0.0
     has_agl = _are_finite(prior.agl_m, prior.sigma_agl_m) and (prior.agl_m or 0.0) > 0.0
     has_altitude = _are_finite(prior.altitude_m, prior.sigma_altitude_m)
     has_place = _are_finite(position)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 
-from recon import se3
 from recon.posegraph import alignment
 from recon.posegraph.alignment import Scale
 from recon.posegraph.alignment_readings import Alignment, ReadingNoise
@@ -256,25 +256,24 @@ class Segments:
         readings = self._without_constants(segment, segment.constants)
         segment.offsets = with_offsets(segment.constants, readings, placed)
 
-    def refit(self, segment: Segment, pose: Callable[[int], F64]) -> bool:
+    def refit(self, segment: Segment) -> bool:
         """True when the segment's similarity was fitted again, which is due as the segment grows.
 
-        ``pose`` gives the present pose of a key in the graph.
+        Without fixes and loops its place in the world means nothing; the graph has it by dead
+        reckoning.
         """
         growth = REFIT_GROWTH if segment.fitted < SETTLED else SETTLED_GROWTH
         due = max(MIN_KEYFRAMES, int(growth * segment.fitted))
         if segment.keyframes < due:
             return False
-        segment.fitted, nodes = segment.keyframes, segment.nodes
+        segment.fitted = segment.keyframes
         fresh = self._newest_constants()
         readings = self._without_constants(segment, fresh)
         found = alignment.fit(readings, *self._bias_tau_s, slow_share=fresh.slow_share,
                               usual=self._usual_noise())  # fmt: skip
         if found is None:
             return False
-        found = replace(found, bend_rad=_bend_rad(nodes))
-        if "gnss" not in found.sources and nodes[0].key > 0:
-            found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
+        found = replace(found, bend_rad=_bend_rad(segment.nodes))
         if found.sigma_fixes is not None:
             most = np.array([np.inf, np.inf, fresh.sigma_up_m])
             found = replace(found, sigma_fixes=np.minimum(found.sigma_fixes, most))
@@ -298,10 +297,13 @@ class Segments:
         return constants(stretches, span_s, *self._bias_tau_s)
 
     def altitude_offset(self) -> float | None:
-        """Altitude less world z over all placed keyframes; None without any."""
+        """Altitude less world z over the keyframes that fixes place, else over those of the first
+        segment, from which all is reckoned; None without any."""
+        known = [one for one in self if one.rests_on_fixes]
+        known = known or [one for one in islice(self, 1) if one.similarity is not None]
         apart = [
-            n.prior.altitude_m - frame.pose(n.T_odom_camera)[2, 3]
-            for segment, frame in self._placed()
+            n.prior.altitude_m - segment.frame.pose(n.T_odom_camera)[2, 3]
+            for segment in known
             for n in segment.nodes
             if n.prior.altitude_m is not None
         ]
@@ -336,18 +338,6 @@ def _bend_rad(nodes: list[Node]) -> float:
     A random walk of variance v from end to end has v / 6 about its mean.
     """
     return float(np.sqrt(sum(np.trace(n.covariance[:3, :3]) for n in nodes[1:]) / 18.0))
-
-
-def _kept_in_place(found: Alignment, first: Node, T: F64) -> Alignment:
-    """A frame without fixes, moved so that its first keyframe stays at ``T``, and turned to the
-    heading there when no compass gives one."""
-    R = found.R
-    if "attitude" not in found.sources:
-        turn = T[:3, :3] @ (R @ first.T_odom_camera[:3, :3]).T
-        yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-        R = se3.so3_exp(np.array([0.0, 0.0, float(yaw)])) @ R
-    t = T[:3, 3] - found.scale * R @ first.T_odom_camera[:3, 3]
-    return replace(found, R=R, t=t)
 
 
 def _segment_of(known: Sequence[Segment], seq: int) -> int | None:

@@ -219,10 +219,13 @@ def test_a_compass_wrong_by_half_a_turn_yields_to_the_fixes() -> None:
     assert found.scale == pytest.approx(1.5, rel=0.05)
 
 
-def test_fixes_that_jump_for_a_third_of_the_flight_do_not_shift_it() -> None:
+@pytest.mark.parametrize("jumped_from, to", [(10, 20), (17, 30)])
+def test_fixes_that_jump_for_two_fifths_of_the_flight_do_not_shift_it(
+    jumped_from: int, to: int
+) -> None:
     good = noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed=6)
     bad = list(good)
-    for i in range(10, 20):
+    for i in range(jumped_from, to):
         p = bad[i].prior
         assert p.position_m is not None
         jumped = p.position_m + np.array([30.0, -20.0, 8.0])
@@ -315,3 +318,35 @@ def test_a_rangefinder_that_meets_trees_does_not_move_the_scale() -> None:
     found = fit(some)
     assert found is not None
     assert found.scale == pytest.approx(2.0, rel=0.004)
+
+
+def test_fixes_that_err_by_more_than_they_claim_leave_the_scale_as_unsure_as_they_scatter() -> None:
+    """Ten are too few to measure their noise by."""
+    off = []
+    for seed in range(20):
+        some = noisy_nodes(np.eye(3), 2.0, np.zeros(3), seed=seed, gnss_m=4.0)[:20:2]
+        some = [
+            replace(a, height=None, prior=replace(a.prior, sigma_position_m=np.full(3, 0.8)))
+            for a in some
+        ]
+        found = fit(some)
+        assert found is not None
+        off.append(math.log(found.scale / 2.0) / found.sigma_scale)
+    assert 0.5 < math.sqrt(np.mean(np.square(off))) < 1.8
+
+
+def test_the_track_lies_in_the_mean_of_fixes_that_wander() -> None:
+    """What is best for a wander's slope would lay it between the first fix and the last."""
+    rng, wander, some = np.random.default_rng(3), np.zeros(3), []
+    for a in noisy_nodes(np.eye(3), 2.0, np.zeros(3), seed=3, gnss_m=0.2):
+        wander = 0.95 * wander + rng.normal(0, 0.4, 3)
+        assert a.prior.position_m is not None
+        wandered = a.prior.position_m + wander
+        prior = replace(a.prior, position_m=wandered, sigma_position_m=np.full(3, 2.0))
+        some.append(replace(a, prior=prior))
+    found = fit(some)
+    assert found is not None and found.noise is not None and found.noise.horizontal is not None
+    assert found.noise.horizontal.bias > 2.0 * found.noise.horizontal.white
+    middle = found.points(np.mean([a.place_of_fix for a in some], axis=0))
+    fixes = np.mean([a.prior.position_m for a in some], axis=0)
+    np.testing.assert_allclose(middle, fixes, atol=0.05)

@@ -172,9 +172,8 @@ def test_altitudes_that_drift_lay_no_segment_on_another() -> None:
     assert max(sigma or 0.0 for sigma in sigma_m) > 20.0
 
 
-@pytest.mark.slow
 def test_what_is_level_is_as_unsure_as_vision_bends() -> None:
-    flown = stills(4, 0.0)
+    flown = stills(1, 0.0)
     straight, bent = (
         settled(flown, turn_rad=turn).graph.segments[0].similarity for turn in (1e-6, 1e-3)
     )

@@ -345,6 +345,25 @@ def test_without_fixes_a_gap_is_bridged_at_the_last_velocity(burst_ns: int) -> N
     assert np.sqrt(np.trace(pose.covariance[3:, 3:])) > 5.0
 
 
+def test_without_fixes_the_barometer_goes_on_over_a_gap() -> None:
+    """Each segment has an origin of its own; the second begins 25 m higher."""
+    f = flight(70, scale=1.0, turn_every=100)
+    climb_m = np.array([0.0, 0.0, 25.0])
+    graph = PoseGraph(bias_tau_s=WHITE)
+    for i in (*range(16), *range(24, 70)):
+        later = i >= 24
+        z = f.truth[i][2, 3] + later * climb_m[2] + 80.0
+        prior = replace(blind(f.priors[i], True), altitude_m=z, sigma_altitude_m=0.3)
+        T = se3.inverse(f.odom[24 * later]) @ f.odom[i]
+        graph.add_keyframe(i, i * 10**9, int(later), T, f.covariance, prior, (60.0, 0.0))
+    assert not graph.counts["altitude off"]
+    before, after = (np.array([graph.pose(i).T_world_camera[2, 3] for i in part])
+                     for part in (range(16), range(24, 70)))  # fmt: skip
+    true_m = np.mean([f.truth[i][2, 3] for i in range(24, 70)]) + climb_m[2]
+    true_m -= np.mean([f.truth[i][2, 3] for i in range(16)])
+    assert np.mean(after) - np.mean(before) == pytest.approx(true_m, abs=0.5)
+
+
 def to_and_fro(breaks: int, seed: int) -> PoseGraph:
     """A level track over one strip at 50 m, vision lost again and again; only a mount that is
     about level gives the tilt, and nothing the heading."""
