@@ -10,10 +10,10 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
+from recon.posegraph.filled_view import filled
 from recon.posegraph.ground_control import KeyframeTrack, adjust, supported
-from recon.posegraph.loop_closure import LoopEnd
+from recon.posegraph.loop_closure import FINISHED, LoopEnd, verify
 from recon.posegraph.records import Loop
-from recon.posegraph.submap_loops import filled, verify_surfaces
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.offline.refine.stored_loops import steps_m, stored_loops
 
@@ -108,7 +108,7 @@ def test_opposite_oblique_views_agree_within_their_covariance(off_m: float) -> N
     a, b = _keyframe(1, poses[1]), _keyframe(2, poses[6])
     truth = se3.inverse(poses[1]) @ poses[6]
     guess = se3.exp(np.array([0.004, -0.003, 0.006, off_m, -0.6 * off_m, 0.3])) @ truth
-    loop = verify_surfaces(_view(a), _view(b), guess)
+    loop = verify(_view(a), _view(b), guess, FINISHED)
     assert loop is not None
     T_a_b, covariance, _ = loop
     error = se3.log(T_a_b @ se3.inverse(truth))
@@ -122,9 +122,9 @@ def test_another_ground_and_views_without_any_are_no_loop() -> None:
     poses = _legs()
     a, b = _keyframe(1, poses[1]), _keyframe(2, poses[6], _texture(2))
     guess = se3.inverse(poses[1]) @ poses[6]
-    assert verify_surfaces(_view(a), _view(b), guess) is None
-    assert verify_surfaces(_view(a), _view(_masked(b, slice(0, 0))), guess) is None
-    assert verify_surfaces(_view(_masked(a, slice(0, 0))), _view(b), guess) is None
+    assert verify(_view(a), _view(b), guess, FINISHED) is None
+    assert verify(_view(a), _view(_masked(b, slice(0, 0))), guess, FINISHED) is None
+    assert verify(_view(_masked(a, slice(0, 0))), _view(b), guess, FINISHED) is None
 
 
 def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
@@ -137,7 +137,7 @@ def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
     for a, b in ((1, 8), (2, 7), (2, 8)):
         one, two = (_view(_keyframe(k, poses[k], tiled)) for k in (a, b))
         guess = se3.inverse(poses[a]) @ slip @ poses[b]
-        found = verify_surfaces(one, two, guess)
+        found = verify(one, two, guess, FINISHED)
         if found is not None:
             loops.append(Loop(a, b, *found[:2]))
     truth: F64 = np.array(poses)
