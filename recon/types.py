@@ -104,6 +104,11 @@ class PosePrior:
     is_sigma_claimed: bool = True  # by the receiver; False: sigma_position_m is a typical one
     is_view_assumed: bool = False  # R_world_camera is the nominal mount on a level vehicle
 
+    def place_of_fix(self, T_odom_camera: F64) -> F64:
+        """(3,) where ``position_m`` was, in the odometry, by the camera's pose (4, 4) in it."""
+        R, place = T_odom_camera[:3, :3], T_odom_camera[:3, 3]
+        return place if self.fix_offset is None else np.asarray(R @ self.fix_offset + place)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:

@@ -309,8 +309,7 @@ class VirtualStereoCamera:
 
     def _wait(self, view: Frame) -> None:
         """Keep a view until its partners are there; all fixes since the last one are its own."""
-        prior = self._fixes.given(view.T_odom_camera, view.prior)
-        self._waiting.append(replace(view, prior=prior))
+        self._waiting.append(replace(view, prior=self._fixes.given()))
 
     def ready(self, everything: bool = False) -> Iterator[StereoView]:
         """The views whose partners are there, in order."""

@@ -1,8 +1,8 @@
 """Priors on a keyframe's pose by telemetry: made sound, averaged between keyframes, dead-reckoned.
 
-A keyframe speaks for what came since the one before it: for frames that are no keyframes
-(:class:`FixAverage`), and for keyframes that are no nodes any more (:func:`averaged`). The mean of
-fixes is the fix of the mean place, in whatever frame and scale vision has it.
+A keyframe speaks for what came since the one before it (:func:`averaged`): for frames that are no
+keyframes (:class:`FixAverage`), and for keyframes that are no nodes any more. The mean of fixes is
+the fix of the mean place, in whatever frame and scale vision has it.
 
 The difference of two travels of one run errs by the time between them only, and so gives the scale
 of the odometry better than fixes, whose error wanders.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -56,13 +56,14 @@ def _is_finite(value: object, shape: tuple[int, ...]) -> bool:
 
 
 def sound(prior: PosePrior) -> PosePrior:
-    """The prior without readings that are not finite, and no sigma below what a sensor reaches."""
+    """The prior without readings that cannot be, as an attitude without an error, and no sigma
+    below what a sensor reaches."""
     R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
     has_turn = _are_finite(R, prior.sigma_tilt_rad, prior.sigma_yaw_rad)
     has_turn &= min(prior.sigma_tilt_rad, prior.sigma_yaw_rad) > 0.0
     has_agl = _are_finite(prior.agl_m, prior.sigma_agl_m) and (prior.agl_m or 0.0) > 0.0
     has_altitude = _are_finite(prior.altitude_m, prior.sigma_altitude_m)
-    has_place = _are_finite(position)
+    has_place, has_own = _are_finite(position), _are_finite(prior.gnss_minus_baro_m)
     is_fix = has_place and _are_finite(sigma)
     return replace(
         prior,
@@ -75,7 +76,8 @@ def sound(prior: PosePrior) -> PosePrior:
         sigma_agl_m=max(prior.sigma_agl_m, MIN_FIX_M),
         altitude_m=prior.altitude_m if has_altitude else None,
         sigma_altitude_m=max(prior.sigma_altitude_m, MIN_FIX_M),
-        gnss_minus_baro_m=prior.gnss_minus_baro_m if _are_finite(prior.gnss_minus_baro_m) else None,
+        gnss_minus_baro_m=prior.gnss_minus_baro_m if has_own else None,
+        gnss_minus_baro_fixes=prior.gnss_minus_baro_fixes if has_own else 0,
     )
 
 
@@ -99,45 +101,35 @@ def off_attitudes(seen: F64, measured: F64, has_heading: Bool) -> F64:
     return np.where(has_heading[:, None], turn, tilt)
 
 
-@dataclass(slots=True, eq=False)
 class FixAverage:
     """Takes every tracked frame; gives a keyframe the mean of what came since the one before."""
 
-    _places: list[F64] = field(default_factory=list)  # (3,) in the segment's odometry
-    _fixes: list[F64] = field(default_factory=list)  # (3,) m
-    _gnss_minus_baro: dict[int, float] = field(default_factory=dict)  # m by time of the fix
-    _last_ns: int = 0
+    def __init__(self) -> None:
+        self._last_ns = 0  # of the receiver's own altitude
+        self.forget()
 
     def take(self, T_odom_camera: F64, prior: PosePrior) -> None:
         """Add a frame of the track with its telemetry."""
-        if prior.position_m is not None and prior.sigma_position_m is not None:
-            self._places.append(T_odom_camera[:3, 3])
-            self._fixes.append(prior.position_m)
-        if prior.gnss_minus_baro_m is not None and prior.gnss_minus_baro_ns > self._last_ns:
-            self._gnss_minus_baro[prior.gnss_minus_baro_ns] = prior.gnss_minus_baro_m
+        if prior.gnss_minus_baro_ns <= self._last_ns:  # that of the frame before, again
+            prior = replace(prior, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
+        self._last_ns = max(self._last_ns, prior.gnss_minus_baro_ns)
+        self._fixes += has_fix(prior)
+        if self._mean is not None:
+            prior = averaged((T_odom_camera, prior), self._mean, 1.0 / max(self._fixes, 1))
+        self._mean = T_odom_camera, prior
 
-    def given(self, T_odom_camera: F64, prior: PosePrior) -> PosePrior:
-        """The prior of a keyframe with all that was taken since the last one, and start again."""
-        out = prior
-        if len(self._fixes) > 1 and prior.position_m is not None:
-            place = se3.transform(se3.inverse(T_odom_camera), np.mean(self._places, axis=0)[None])
-            out = replace(out, position_m=np.mean(self._fixes, axis=0), fix_offset=place[0])
-        if self._gnss_minus_baro:
-            out = replace(
-                out, gnss_minus_baro_m=float(np.mean(list(self._gnss_minus_baro.values()))),
-                gnss_minus_baro_fixes=len(self._gnss_minus_baro),
-            )  # fmt: skip
-            self._last_ns = max(self._gnss_minus_baro)
-        elif out.gnss_minus_baro_m is not None:
-            out = replace(out, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
+    def given(self) -> PosePrior:
+        """The prior of the last frame with the mean of all that was taken since this was asked for
+        last."""
+        assert self._mean is not None, "a keyframe is taken first"
+        _, prior = self._mean
         self.forget()
-        return out
+        return prior
 
     def forget(self) -> None:
         """Start again, as after a break of the track."""
-        self._places.clear()
-        self._fixes.clear()
-        self._gnss_minus_baro.clear()
+        self._mean: tuple[F64, PosePrior] | None = None
+        self._fixes = 0
 
 
 def without_fixes(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:
@@ -153,32 +145,29 @@ def without_fixes(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]
     ]
 
 
-def averaged(node: Node, left: Node) -> PosePrior:
-    """The prior of a node that also speaks for the one before it, which is left out: with the mean
-    of both fixes, which is the fix of the mean place, and of the receiver's own altitudes."""
-    one, other = node.prior, left.prior
-    if other.position_m is None or other.sigma_position_m is None:
-        return one
-    share = left.weight / (left.weight + node.weight)
-    fix_m, sigma_m = one.position_m, one.sigma_position_m
-    own_m, own, others_m, others = (
-        one.gnss_minus_baro_m, one.gnss_minus_baro_fixes,
-        other.gnss_minus_baro_m, other.gnss_minus_baro_fixes,
-    )  # fmt: skip
+def averaged(one: tuple[F64, PosePrior], other: tuple[F64, PosePrior], share: float) -> PosePrior:
+    """The prior at a pose (4, 4) that also speaks for an earlier one, which is left out: with the
+    mean of both fixes, of which ``one`` has a ``share``, that is the fix of the mean place, and of
+    the receiver's own altitudes."""
+    (T, own), (T_other, others) = one, other
+    readings = own.gnss_minus_baro_fixes + others.gnss_minus_baro_fixes
+    if readings:
+        sums_m = ((p.gnss_minus_baro_m or 0.0) * p.gnss_minus_baro_fixes for p in (own, others))
+        mean_m = sum(sums_m) / readings
+        own = replace(own, gnss_minus_baro_m=mean_m, gnss_minus_baro_fixes=readings)
+    fix_m, sigma_m, others_m = own.position_m, own.sigma_position_m, others.position_m
+    if others_m is None or others.sigma_position_m is None:
+        return own
     if fix_m is None or sigma_m is None:
-        share, fix_m, sigma_m = 1.0, other.position_m, other.sigma_position_m
-        one = replace(one, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
-    elif own_m is not None and others_m is not None and others > 0:
-        mean_m = (own_m * own + others_m * others) / (own + others)
-        one = replace(one, gnss_minus_baro_m=mean_m, gnss_minus_baro_fixes=own + others)
-    if np.any(other.sigma_position_m > MAX_WORSE * sigma_m):
-        return one
-    place = node.place_of_fix + share * (left.place_of_fix - node.place_of_fix)
+        share, fix_m, sigma_m = 0.0, others_m, others.sigma_position_m
+    elif np.any(others.sigma_position_m > MAX_WORSE * sigma_m):
+        return own
+    place = share * own.place_of_fix(T) + (1.0 - share) * others.place_of_fix(T_other)
     return replace(
-        one,
-        position_m=fix_m + share * (other.position_m - fix_m),
+        own,
+        position_m=share * fix_m + (1.0 - share) * others_m,
         sigma_position_m=sigma_m,
-        fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
+        fix_offset=se3.transform(se3.inverse(T), place[None])[0],
     )
 
 

@@ -38,8 +38,7 @@ class Node:
     @property
     def place_of_fix(self) -> F64:
         """(3,) where the prior's position was, in the odometry."""
-        offset, T = self.prior.fix_offset, self.T_odom_camera
-        return T[:3, 3] if offset is None else T[:3, :3] @ offset + T[:3, 3]
+        return self.prior.place_of_fix(self.T_odom_camera)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -92,7 +92,11 @@ def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int
             node = replace(
                 node,
                 covariance=left.covariance + se3.left_covariance(T, node.covariance),
-                prior=averaged(node, left),
+                prior=averaged(
+                    (node.T_odom_camera, node.prior),
+                    (left.T_odom_camera, left.prior),
+                    node.weight / (node.weight + left.weight),
+                ),
                 weight=left.weight + node.weight,
             )
         kept.append(replace(node, key=len(kept)))

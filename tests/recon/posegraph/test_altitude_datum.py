@@ -84,7 +84,7 @@ def test_the_mean_of_an_interval_lies_where_its_fixes_were() -> None:
                           gnss_minus_baro_fixes=1, gnss_minus_baro_ns=1 + i // 2)  # fmt: skip
         average.take(T, prior)
         if i % 8 == 7:
-            given = average.given(T, prior)
+            given = average.given()
             assert given.gnss_minus_baro_fixes == 4 and given.fix_offset is not None
             assert given.gnss_minus_baro_m == pytest.approx(i // 2 - 1.5)
             nodes.append(node(T, given, None))
@@ -99,6 +99,6 @@ def test_nothing_is_carried_over_a_break() -> None:
     average.forget()
     later = PosePrior(position_m=np.zeros(3), sigma_position_m=SIGMA)
     average.take(np.eye(4), later)
-    given = average.given(np.eye(4), later)
+    given = average.given()
     assert given.fix_offset is None
     assert given.position_m is not None and not given.position_m.any()
