@@ -28,7 +28,11 @@ FARTHEST_M = 1e6
 
 
 class KeyframeMap:
-    """Places keyframes in the world. It belongs to who reconstructs, until all is done."""
+    """Places keyframes in the world. It belongs to who reconstructs, until all is done.
+
+    The keyframes of a segment are a *chain*: the odometry's steps from one to the next, each
+    refined by ICP. It has the odometry's frame and unit, and the graph takes its poses.
+    """
 
     def __init__(
         self,
@@ -126,11 +130,12 @@ class KeyframeMap:
         self.graph.segments[view.segment].add_surface(view.seq, points, view.frame.prior)
 
     def apart(self) -> list[tuple[int, int]]:
-        """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
+        """First and last keyframe of each segment that nothing ties to the rest of the scan."""
         return self.graph.segments.apart(self.graph.loops)
 
     def false(self) -> list[tuple[int, int]]:
-        """First and last keyframe of each stretch in which vision is wrong, and its depth, too."""
+        """First and last keyframe of each step or segment in which vision is wrong, and its depth,
+        too."""
         segments = [(one.surface[0], one.surface[-1]) for one in self.graph.segments.false()]
         return [*self.graph.refuted.items(), *segments]
 

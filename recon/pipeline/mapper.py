@@ -275,7 +275,7 @@ class Mapper:
         where that was lost until now."""
         with self._timing("track"):
             *late, tracked = self.odometry.track(frame)
-        self.refused -= Counter(still.reason for still in late)
+        self.refused -= Counter(still.reason for still in late)  # as they were counted when lost
         if tracked.state is Tracking.WAITING:
             self._waiting[tracked.reason] += 1
         elif not tracked.is_placed:
@@ -357,7 +357,7 @@ class Mapper:
 
     def drain(self) -> tuple[Event, ...]:
         """The views still waiting for partners, up to one whose work failed."""
-        self.views.end_stretch()
+        self.views.end_segment()
         for view in self.views.ready(everything=True):
             self._worker.offer(view)
         return tuple(self._finished(everything=True))

@@ -57,7 +57,7 @@ FIRST_SHARE = 0.3
 nearer see the ground from too much the same place."""
 
 LAST_VIEW_SHARE = 0.1
-"""A stretch's last frame becomes a view when it is this share of a usual step further on."""
+"""A segment's last frame becomes a view when it is this share of a usual step further on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,8 +147,8 @@ class ViewSelection:
             self._recent.append(frame)
         return False
 
-    def end_stretch(self, frame: Frame | None) -> bool:
-        """True when the last frame of a stretch must be a view: it shows more than the last one.
+    def end_segment(self, frame: Frame | None) -> bool:
+        """True when the last frame of a segment must be a view: it shows more than the last one.
         ``frame`` is that frame unless it is a view already. The newest ground is not in the view
         before; a frame between the two becomes its partner.
         """
@@ -218,7 +218,7 @@ class ViewSelection:
         return self.confirmed(view)
 
     def confirmed(self, view: Frame) -> bool:
-        """False for a stretch of two views: no other view can contradict a single pair.
+        """False for a segment of two views: no other view can contradict a single pair.
 
         Clouds in the sky or a false first motion would otherwise become surface. A baseline
         that the operator fixed pairs each view once and is not checked.
@@ -287,7 +287,7 @@ class VirtualStereoCamera:
     def take(self, tracked: Frame) -> bool:
         """Whether the next frame becomes a view."""
         if tracked.segment != self._segment:
-            self.end_stretch()
+            self.end_segment()
             self._segment = tracked.segment
         if not tracked.is_placed:
             return False
@@ -300,9 +300,9 @@ class VirtualStereoCamera:
         self._latest = None if is_view else frame
         return is_view
 
-    def end_stretch(self) -> None:
-        """Make a view of a stretch's last frame: only it shows what the camera saw last."""
-        if self.selection.end_stretch(self._latest) and self._latest is not None:
+    def end_segment(self) -> None:
+        """Make a view of a segment's last frame: only it shows what the camera saw last."""
+        if self.selection.end_segment(self._latest) and self._latest is not None:
             self._wait(self._latest)
         self._fixes.forget()
         self._latest = None

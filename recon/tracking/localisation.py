@@ -230,17 +230,17 @@ class Localiser:
         """Where the camera may be, most trusted first."""
         key = keyframes[-1]
         T_odom_camera, turn, gap_s = motion.ahead(new.time_ns, new.prior)
-        low_frame_rate = gap_s > LOW_RATE_GAP_S
+        is_stale = gap_s > LOW_RATE_GAP_S  # the last pose, of whatever frame since was lost
         by_motion = se3.inverse(T_odom_camera)
-        if not low_frame_rate or turn is not None:
-            share = WIDE_SEARCH_SHARE if low_frame_rate else SEARCH_SHARE
+        if not is_stale or turn is not None:
+            share = WIDE_SEARCH_SHARE if is_stale else SEARCH_SHARE
             yield key, by_motion, share, False
-        if low_frame_rate or lost:
-            yield from self._by_features(new, keyframes, low_frame_rate)
-        if not low_frame_rate or turn is None:
+        if is_stale or lost:
+            yield from self._by_features(new, keyframes, is_stale)
+        if not is_stale or turn is None:
             yield key, by_motion, WIDE_SEARCH_SHARE, False
-        if not (low_frame_rate or lost):
-            yield from self._by_features(new, keyframes, low_frame_rate)
+        if not (is_stale or lost):
+            yield from self._by_features(new, keyframes, is_stale)
 
     def _by_features(
         self, new: Frame, keyframes: Sequence[Frame], low_frame_rate: bool

@@ -40,17 +40,25 @@ from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
-MAX_TURN_RAD = 0.25
-"""A frame that turned this much since the last keyframe becomes one."""
+MAX_TURN_RAD, MIN_OVERLAP = 0.25, 0.45
+"""A frame that turned so much since the last keyframe, or shows a smaller share of its corners,
+becomes one: what came into view has no landmarks yet. So much is a fifth of a usual view."""
+
+FIRST_STEP, FIRST_TURN_RAD = 0.7, 0.12
+"""Of the usual step: the baseline of a segment's first two keyframes, as no frame before the second
+has a pose. Their motion may turn by so much otherwise than telemetry: attitudes are off by some
+degrees, and a false motion between two views by more."""
 
 WINDOW = 8
-"""Keyframes adjusted together."""
+"""Keyframes adjusted together. Of those further back, 0.8 of the height and more, a wide image
+shows nothing any more."""
 
 LOST_AFTER = 8
-"""Frames in a row without a pose before a new segment starts."""
+"""Frames in a row without a pose before a new segment starts: a third of a second of video."""
 
 OVERDUE = 1.3
-"""A blurred frame becomes a keyframe when the last is this many steps away."""
+"""A blurred frame becomes a keyframe when the last is this many steps away: partners may be 2.2
+steps apart, and a sharp frame is likely to come sooner."""
 
 MAX_GAP_S, SOUGHT_GAP_S, ROLLING_GAP_S = 0.17, 0.09, 0.05
 """A frame this long after the last is followed: with a global shutter, while a readout is sought,
@@ -58,7 +66,8 @@ and with a rolling shutter, whose rows need neighbours closer by."""
 
 
 EARLY = 4
-"""Frames after a segment's first that show how its rows moved."""
+"""Frames after a segment's first that show how its rows moved: a curve of the second degree needs
+two, and noise more."""
 
 
 class Odometry:
@@ -94,7 +103,7 @@ class Odometry:
         clock = self._row_track.clock
         self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
         self.focal, self._watched_seq = FocalWatch(self.K), -1
-        self._unsettled: Frame | None = None  # its rows' motion will be known better
+        self._rows_awaited: Frame | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self._row_track)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
@@ -205,7 +214,7 @@ class Odometry:
         self._lost = 0
         self._localiser.begin()
         self._row_track.begin()
-        self._unsettled, self._early = None, []
+        self._rows_awaited, self._early = None, []
         R, t = new.prior.R_world_camera, new.prior.position_m
         T_odom_camera = se3.compose(
             np.diag([1.0, -1, -1]) if R is None else R, np.zeros(3) if t is None else t
@@ -243,13 +252,20 @@ class Odometry:
         if ok.sum() < 2 * MIN_TRACKS:
             return self._missed(new, "too few matches with the first frame")
         self._lost = 0
-        least = 0.7 * self._base_to_height
+        least = FIRST_STEP * self._base_to_height
         moved = prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
         view = None
         if moved >= least or (R_b_a is None and self._is_no_turn(first.uv[ok], uv[ok])):
             inverse_depth = 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0
             view = self._localiser.motion_since(
-                first, new, uv, ok, inverse_depth, R_b_a, 0.12, may_be_wrong=self._low_frame_rate
+                first,
+                new,
+                uv,
+                ok,
+                inverse_depth,
+                R_b_a,
+                FIRST_TURN_RAD,
+                may_be_wrong=self._low_frame_rate,
             )
         if moved < least and (view is None or view.parallax_rad < least):
             if self._row_track.is_known and len(self._early) < EARLY:
@@ -302,9 +318,9 @@ class Odometry:
         self._motion_model.update(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
         due = self._base_to_height * (OVERDUE if new.is_blurred else 1.0)
-        if base < due and found.share > 0.45 and turned < MAX_TURN_RAD:
+        if base < due and found.share > MIN_OVERLAP and turned < MAX_TURN_RAD:
             self._row_track.add(new.row_motion, T_camera_odom)
-            self._settle()
+            self._readjust()
             return self._found(new, Tracking.TRACKED, T_odom_camera, tracks)
         self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns)
         share = 0.5 * SEARCH_SHARE
@@ -360,7 +376,7 @@ class Odometry:
         landmark = np.concatenate([landmark, np.full(len(fresh), -1, np.int64)])
         key_new = self._keyframe(new, T_camera_odom, uv, landmark, seen[0][0].landmarks)
         self.keyframes.append(key_new)
-        self._unsettled = key_new if new.row_motion.rows is not None else None
+        self._rows_awaited = key_new if new.row_motion.rows is not None else None
         window = self.keyframes[-WINDOW - 2 :]
         adjusted = adjust_window(window, self.K)
         if len(window) > WINDOW and window[0].seq > self._watched_seq:
@@ -370,12 +386,12 @@ class Odometry:
         self._forget()
         return self._found(new, Tracking.KEYFRAME, key_new.T_odom_camera, int(seen[0][2].sum()))
 
-    def _settle(self) -> None:
+    def _readjust(self) -> None:
         """Adjust the window again once frames after its last keyframe say how its rows moved, and
         look for the readout, until it is known that there is none."""
-        if self._unsettled is not None and self._unsettled.row_motion.is_settled:
+        if self._rows_awaited is not None and self._rows_awaited.row_motion.is_settled:
             adjust_window(self.keyframes, self.K)
-            self._unsettled = None
+            self._rows_awaited = None
             search = self.readout if self._row_track.is_rolling else None
             if search is not None and search.look(self.keyframes):
                 adjust_window(self.keyframes, self.K)

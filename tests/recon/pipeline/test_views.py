@@ -173,15 +173,15 @@ def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None
         for j in range(10):
             state = "tracked" if j else "keyframe" if i else "started"
             assert (offer(views, 10 * i + j, 5.0 * i + 0.5 * j, state) is None) == (j > 0)
-    assert not views.end_stretch(frame(20, 10.4))
-    assert not views.end_stretch(frame(28, 14.0, blurred=True))
+    assert not views.end_segment(frame(20, 10.4))
+    assert not views.end_segment(frame(28, 14.0, blurred=True))
     last = frame(28, 14.0)
-    assert views.end_stretch(last) and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
-    assert not views.end_stretch(None) and len(views.partners(last)) == 4
+    assert views.end_segment(last) and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
+    assert not views.end_segment(None) and len(views.partners(last)) == 4
     fixed = ViewSelection(spacing_m=2.0)
     for i in range(3):
         offer(fixed, i, 2.5 * i, "tracked" if i else "started")
-    assert not fixed.end_stretch(frame(3, 6.5))
+    assert not fixed.end_segment(frame(3, 6.5))
 
 
 def test_all_frames_count_where_the_operator_chose_the_baseline_or_wants_the_next_one() -> None:
