@@ -25,7 +25,7 @@ from recon.posegraph.alignment_readings import (
 )
 from recon.posegraph.ground import ASSUMED_TILT_RAD, GUESSED_SHARE, INDEPENDENT_HEIGHTS
 from recon.posegraph.pose_priors import has_fix
-from recon.posegraph.records import Node
+from recon.posegraph.records import SIGMA_STEP, Node
 from recon.posegraph.sensor_noise import (
     ATTITUDE_S,
     FIX_S,
@@ -41,14 +41,15 @@ from recon.similarity import umeyama
 from recon.types import F64
 
 HUBER = 2.5
-"""Whitened residuals beyond this lose weight."""
+"""Whitened residuals beyond this lose weight: of three axes together, noise alone reaches it once
+in ten times, so that little is lost where all is noise."""
 
 WILD = 12.5
 """Beyond this, and beyond twice the median, what a reading pulls falls by the square of its
 residual (redescending, as Hampel's): it is no noise. From a wrong start all residuals are large."""
 
 ODD = 5.0
-"""The same of a fix against those next to it."""
+"""The same of a fix against those next to it, which noise reaches once in a million times."""
 
 SETTLED = 1e-3
 """A step of so many sigmas ends the fit: each is about half as long as the one before."""
@@ -61,9 +62,6 @@ ITERATIONS = 30
 
 ROUNDS = 4
 """Times that the noise of altitudes and the tilt by them are found in turn."""
-
-STEP_SHARE = 0.002
-"""Share of its length by which a motion of vision errs."""
 
 MIN_WALK = 0.02
 """Sigma that no integrated velocity is better than, m / sqrt(s)."""
@@ -115,7 +113,7 @@ def fit(
     heights = None
     if len(readings.fix) and noise.horizontal is not None:
         heights = readings.heights(best.at, best.H, covariance)
-    covariance[6, 6] += STEP_SHARE**2 / max(len(usable) - 1, 1)
+    covariance[6, 6] += SIGMA_STEP**2 / max(len(usable) - 1, 1)
     mean = counted = None
     if len(readings.fix):
         covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.claimed), axis=0))

@@ -16,7 +16,7 @@ from recon import se3
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_attitudes
-from recon.posegraph.records import Loop, Node
+from recon.posegraph.records import SIGMA_STEP, Loop, Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
 from recon.posegraph.smoother import NO_SCALE, Smoother
@@ -44,9 +44,8 @@ KNOWN_SCALE, UNKNOWN_SCALE = 0.1, 1.0
 """Sigma of the logarithm of a segment's first scale: at least, as its alignment fits one scale to
 a track whose scale drifts; and where no reading measures it."""
 
-SIGMA_STEP, SIGMA_SCALE_WALK = 0.002, 0.003
-"""Sigma of one motion of vision, as a share of its length, and of the change of the scale from
-block to block."""
+SIGMA_SCALE_WALK = 0.003
+"""Sigma of the change of the scale from block to block."""
 
 BLOCKS_PER_HEIGHT = 2.0
 """Heights above ground of so many blocks count as one: relief is the same under neighbours."""

@@ -67,6 +67,9 @@ class Loop:
         return replace(self, T_a_b=T, covariance=se3.in_units(self.covariance, factor))
 
 
+SIGMA_STEP = 0.002
+"""Sigma of one motion of vision, as a share of its length."""
+
 LOOP_WINDOW = 15
 """Keyframes within which two loops support each other: between those, vision is trusted."""
 

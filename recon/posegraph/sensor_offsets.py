@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import parallel, se3
+from recon.posegraph.alignment import HUBER
 from recon.posegraph.alignment_readings import Alignment, from_middle
 from recon.posegraph.ground import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import off_attitudes
@@ -28,9 +29,6 @@ BOUND_RAD = np.radians(5.0)
 
 MIN_ATTITUDES = 8
 """Minimum number of attitudes of a stretch."""
-
-HUBER = 2.5
-"""Whitened residuals beyond this lose weight."""
 
 WILD = 5.0
 """Median of the whitened residuals beyond which attitudes and images do not belong together."""

@@ -33,20 +33,24 @@ from recon.tracking.sift_features import (
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
 MIN_BASE_TO_HEIGHT = 0.03
-"""Motion over the distance to the ground, under which two frames are not triangulated."""
+"""Motion over the distance to the ground, under which two frames are not triangulated: with a focal
+length of 500 px, half a pixel would be 3 % of the distance."""
 
 SEARCH_SHARE, WIDE_SEARCH_SHARE = 0.03, 0.09
-"""ZSSD search radii around a good and a poor prediction, as shares of the image's width."""
+"""ZSSD search radii around a good and a poor prediction, as shares of the image's width: 2 and 6
+degrees of a wide view, as attitudes err by and as a camera turns from frame to frame."""
 
 MIN_TRACKS, MIN_TRACK_SHARE = 40, 0.25
 """Inliers under which a frame is lost, and matches as a share of the corners that should be
 visible."""
 
 TRACKED_LANDMARKS = 450
-"""Of both keyframes, for a frame's pose; new keyframes match all their corners."""
+"""Of both keyframes, for a frame's pose; new keyframes match all their corners. The sigma of a pose
+falls with their root only, and their time grows as they do."""
 
 MAX_TILT_ERROR_RAD = 0.35
-"""Vision against attitude: more is a false solution."""
+"""Vision against attitude, 20 degrees: since the keyframe before no gimbal or compass in order errs
+by more, so it is a false solution."""
 
 LOOSE_PX = 6.0
 """Gate of a second try: a rolling shutter bends images that much."""
@@ -55,7 +59,8 @@ LOW_RATE_GAP_S = 0.7
 """Frames further apart are stills: no motion model holds."""
 
 RECALLED = 4
-"""Newest keyframes that a frame is compared with by features."""
+"""Newest keyframes that a frame is compared with by features: of stills with 75 % overlap no
+more show the same ground."""
 
 CLEAR_SHARE = 0.6
 """Share of the corners searched: if so many are found, no other start is tried."""

@@ -136,7 +136,7 @@ def harris_cells(
 
 
 HARRIS_K = 0.04
-"""k of Eq. 5."""
+"""k of Eq. 5, as usual since Harris and Stephens 1988 (0.04 to 0.06)."""
 
 MIN_RESPONSE, MIN_CONTRAST = 4.0, 2.0
 """R of Eq. 5, gray levels to the fourth, and standard deviation of a patch, gray levels, at least:
@@ -150,6 +150,7 @@ LEVELS, COARSE_REACH_PX = 5, 8
 at most."""
 
 REFINE_ITERATIONS = 6
+"""Gauss-Newton steps to the sub-pixel place, at most; a step below 0.02 px ends it."""
 
 FAR = 1e6
 """px; stands for a prediction that is not a number."""

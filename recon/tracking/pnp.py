@@ -21,16 +21,18 @@ from recon.tracking.bundle import compose, linearise, se3_exp
 from recon.types import F64, Bool
 
 THRESHOLD_PX = 2.0
-"""Largest reprojection error of an inlier."""
+"""Largest reprojection error of an inlier: a corner errs by some tenths, and a
+landmark by as much as the views that gave it."""
 
 MIN_INLIERS, MIN_INLIER_SHARE = 15, 0.3
 """Inliers of a pose, and their share of the points given, at least."""
 
 DRAWS, CONFIDENCE = 200, 0.9999
-"""RANSAC's draws, at most, and the chance of a clean draw at which it stops early."""
+"""RANSAC's draws, at most, and the chance of a clean draw at which it stops early. Where half of
+the points are wrong, one draw of five points in 32 is clean: 200 draws hold one at 99.8 %."""
 
 MAX_SIGMA_SHARE = 0.03
-"""Sigma of the position over the median depth, at most."""
+"""Sigma of the position over the median depth, at most: as much as the shortest baseline."""
 
 FLOOR_PX = 0.1
 """Least error assumed of a match, 1 sigma."""

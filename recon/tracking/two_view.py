@@ -19,7 +19,14 @@ from recon.tracking import bundle, robust_geometry
 from recon.types import F64, Bool
 
 MAX_ERROR_PX = 1.5
-"""Error of a match that a motion explains, at most."""
+"""Error of a match that a motion explains, at most: some sigmas of two corners."""
+
+MIN_PARALLAX_RAD, MIN_INLIERS = 2e-3, 20
+"""Between the rays of a point, a pixel at a focal length of 500 px; and points that give a motion,
+which has five numbers."""
+
+AS_GOOD = 0.92
+"""Of the most inliers: motions with as many explain the pixels alike, and the ground decides."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,8 +81,8 @@ def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64) -> TwoView | None:
     T_b_a = se3.compose(R, t)
     for _ in range(2):
         points, angle = bundle.triangulate(np.eye(4), T_b_a, K, uv_a, uv_b)
-        use = np.flatnonzero(np.isfinite(points[:, 0]) & (angle > 2e-3))
-        if use.size < 20:
+        use = np.flatnonzero(np.isfinite(points[:, 0]) & (angle > MIN_PARALLAX_RAD))
+        if use.size < MIN_INLIERS:
             return None
         index = np.arange(use.size)
         result = bundle.adjust(
@@ -97,8 +104,8 @@ def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64) -> TwoView | None:
     error = np.maximum(
         reprojection_error(np.eye(4), points, K, uv_a), reprojection_error(T_b_a, points, K, uv_b)
     )
-    inliers = (error < MAX_ERROR_PX) & (angle > 2e-3)
-    if inliers.sum() < 20:
+    inliers = (error < MAX_ERROR_PX) & (angle > MIN_PARALLAX_RAD)
+    if inliers.sum() < MIN_INLIERS:
         return None
     points[~inliers] = np.nan
     return TwoView(T_b_a, points, inliers, float(np.median(angle[inliers])))
@@ -145,5 +152,5 @@ def solve(
     most = max(int(view.inliers.sum()) for view, _ in found)
     if most < 0.5 * uv_a.shape[0]:
         return None
-    good = [(view, level) for view, level in found if view.inliers.sum() > 0.92 * most]
+    good = [(view, level) for view, level in found if view.inliers.sum() > AS_GOOD * most]
     return max(good, key=lambda item: item[1])[0]
