@@ -1,30 +1,28 @@
 """Places seen before: candidates by overlap of the views, each verified before it is accepted.
 
 Verification is independent of the pose graph: corners of one keyframe with their depths are
-matched in the other's image (ZSSD) and give a pose by EPnP, and the depths that the other
-keyframe has there must agree.
+matched in the other's image (ZSSD), give a pose by EPnP, and the two depth maps must then
+agree by ICP.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
+from recon.mapping.registration import agreed_motion, register_projective
 from recon.plane import plane_normal
 from recon.tracking import matching, pnp
 from recon.tracking.sift_features import FEATURE_SHARES, features, match_features
 from recon.types import F32, F64, I64, U8, Bool, DepthMap
 
-MIN_RAD, COMMON_TURN, COMMON_SHIFT = 2e-4, 0.1, 0.3
-"""Sigma of a loop's turn at least, and shares of its depths' sigma by which all points of a depth
-map are off alike, as a tilt and a shift: that does not average out."""
-
-PIXEL_SIGMA, GATE_SIGMAS = 0.4, 3.0
-"""Sigma of a match in px, and of how many sigmas depths may differ there."""
+MIN_RAD, MIN_SHARE = 2e-4, 0.1
+"""A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
+points of one depth map have in common does not average out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,7 @@ class LoopConfig:
     matching: matching.MatchingConfig
     search_shares: tuple[float, ...]  # radii about the predicted places, shares of the width
     by_features: bool  # where those are too far off, the features of both images predict
-    min_matches: int  # that one motion and the depths of both explain
+    min_matches: int  # that one motion explains
     min_share: float  # of all matches
 
 
@@ -138,9 +136,11 @@ def verify(
         found = matching.match(
             pyramids[0], uv, pyramids[1], predicted, radius, warp, config.matching
         )
-        loop = _closed(a, b, points[found.ok], found.uv_px[found.ok], prior, config)
-        if loop is not None:
-            return loop
+        seen = found.uv_px[found.ok].astype(np.float64)
+        solved = pnp.solve(points[found.ok], seen, b.K, prior, min_inliers=config.min_matches)
+        if solved is not None and solved.inlier_share >= config.min_share:
+            T_a_b = se3.inverse(solved.T_camera_points)
+            return _with_icp(a, b, T_a_b, se3.left_covariance(T_a_b, solved.covariance))
     return None
 
 
@@ -157,36 +157,6 @@ def _predictions(
         there, warp = shared.predict(uv)
         for share in FEATURE_SHARES:
             yield there, warp, None, share
-
-
-def _closed(
-    a: LoopEnd, b: LoopEnd, points: F64, uv: F32, prior: F64 | None, config: LoopConfig
-) -> LoopClosure | None:
-    """The loop by a's ``points`` (N, 3), which b sees at ``uv`` (N, 2); None where they have no
-    common motion, or b has other depths there."""
-    there, _, known = on_surface(b, uv.astype(np.float64))
-    points, there, uv_b = points[known], there[known], uv[known].astype(np.float64)
-    solved = pnp.solve(points, uv_b, b.K, prior, min_inliers=config.min_matches)
-    if solved is None:
-        return None
-    seen = se3.transform(solved.T_camera_points, points)[:, 2]
-    growth = float(np.median((seen / there[:, 2])[solved.inliers]))
-    sigma = _sigma(a, points[:, 2]) + growth * _sigma(b, there[:, 2])
-    agreed = solved.inliers & (np.abs(seen - growth * there[:, 2]) < GATE_SIGMAS * sigma)
-    if np.count_nonzero(agreed) < max(config.min_matches, config.min_share * len(points)):
-        return None
-    T_a_b = se3.inverse(solved.T_camera_points)
-    depth, sigma_m = float(np.nanmedian(a.depth.depth_m)), float(np.nanmedian(a.depth.sigma_m))
-    # Depths of one keyframe err together, which the pixels do not show.
-    turn = np.hypot(COMMON_TURN * sigma_m / depth, MIN_RAD)
-    common = np.diag([turn**2] * 3 + [(COMMON_SHIFT * sigma_m) ** 2] * 3)
-    return T_a_b, se3.left_covariance(T_a_b, solved.covariance) + common, growth
-
-
-def _sigma(end: LoopEnd, depths: F64) -> F64:
-    """(N,) m of ``depths`` (N,), by the depth map's median sigma and a pixel's width there."""
-    own = float(np.nanmedian(end.depth.sigma_m))
-    return np.asarray(np.hypot(own, PIXEL_SIGMA * depths / end.K[0, 0]))
 
 
 def landmarks(end: LoopEnd, config: matching.MatchingConfig) -> tuple[F64, F64]:
@@ -236,3 +206,39 @@ def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
         stepped = ways * (level / np.where(np.abs(slope) > 1e-6, slope, np.nan))[:, None]
         out[:, :, axis] = (project(K_b, se3.transform(T_b_a, stepped)) - here) / 8.0
     return out
+
+
+def _with_icp(a: LoopEnd, b: LoopEnd, T_a_b: F64, covariance: F64) -> LoopClosure | None:
+    """The loop refined by ICP of the depth maps; None when they contradict it."""
+    growth = _growth(a, b, T_a_b)
+    if growth is None:
+        return None
+    b = replace(b, depth=b.depth.scaled(growth, b.depth.T_world_camera))
+    # Depths of one keyframe err together, which the pixels do not show.
+    depth = float(np.nanmedian(a.depth.depth_m))
+    sigma = float(np.nanmedian(a.depth.sigma_m))
+    covariance = covariance + np.diag([(sigma / depth) ** 2 * 0.01] * 3 + [(0.3 * sigma) ** 2] * 3)
+    aligned = register_projective(b.depth, a.depth, T_a_b)
+    agreed = agreed_motion(T_a_b, covariance, aligned)
+    if agreed is None:
+        return None
+    T, covariance = agreed
+    covariance = covariance + np.diag([MIN_RAD**2] * 3 + [(MIN_SHARE * sigma) ** 2] * 3)
+    return T, covariance, growth
+
+
+def _growth(a: LoopEnd, b: LoopEnd, T_a_b: F64) -> float | None:
+    """Median ratio of a's depths to b's where both see the same; None with too few."""
+    h, w = a.depth.depth_m.shape
+    v, u = np.mgrid[0:h:4, 0:w:4].reshape(2, -1)
+    depth = a.depth.depth_m[v, u].astype(np.float64)
+    known = np.isfinite(depth)
+    points = rays(a.depth.K, np.column_stack([u, v])[known].astype(np.float64))
+    there = se3.transform(se3.inverse(T_a_b), points * depth[known, None])
+    pixel = project(b.depth.K, there)
+    h, w = b.depth.depth_m.shape
+    inside = (pixel >= 0).all(axis=1) & (pixel <= [w - 1, h - 1]).all(axis=1) & (there[:, 2] > 0)
+    at = np.rint(pixel[inside]).astype(np.int64)
+    ratio = there[inside, 2] / b.depth.depth_m[at[:, 1], at[:, 0]]
+    ratio = ratio[np.isfinite(ratio)]
+    return float(np.median(ratio)) if len(ratio) >= 50 else None
