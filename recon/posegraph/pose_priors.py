@@ -106,7 +106,8 @@ class FixAverage:
 
     def __init__(self) -> None:
         self._last_ns = 0  # of the receiver's own altitude
-        self.forget()
+        self._mean: tuple[F64, PosePrior] | None = None  # the last pose, with the mean there
+        self._fixes = 0  # in the mean
 
     def take(self, T_odom_camera: F64, prior: PosePrior) -> None:
         """Add a frame of the track with its telemetry."""
@@ -128,8 +129,7 @@ class FixAverage:
 
     def forget(self) -> None:
         """Start again, as after a break of the track."""
-        self._mean: tuple[F64, PosePrior] | None = None
-        self._fixes = 0
+        self._mean, self._fixes = None, 0
 
 
 def without_fixes(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:
