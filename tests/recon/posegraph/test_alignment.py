@@ -338,16 +338,16 @@ def test_fixes_that_err_by_more_than_they_claim_leave_the_scale_as_unsure_as_the
 
 def test_the_track_lies_in_the_mean_of_fixes_that_wander() -> None:
     """What is best for a wander's slope would lay it between the first fix and the last."""
-    rng, wander, some = np.random.default_rng(3), np.zeros(3), []
+    rng, wander = np.random.default_rng(3), np.zeros(3)
+    some, fixes = [], []
     for a in noisy_nodes(np.eye(3), 2.0, np.zeros(3), seed=3, gnss_m=0.2):
         wander = 0.95 * wander + rng.normal(0, 0.4, 3)
         assert a.prior.position_m is not None
-        wandered = a.prior.position_m + wander
-        prior = replace(a.prior, position_m=wandered, sigma_position_m=np.full(3, 2.0))
+        fixes.append(a.prior.position_m + wander)
+        prior = replace(a.prior, position_m=fixes[-1], sigma_position_m=np.full(3, 2.0))
         some.append(replace(a, prior=prior))
     found = fit(some)
     assert found is not None and found.noise is not None and found.noise.horizontal is not None
     assert found.noise.horizontal.bias > 2.0 * found.noise.horizontal.white
     middle = found.points(np.mean([a.place_of_fix for a in some], axis=0))
-    fixes = np.mean([a.prior.position_m for a in some], axis=0)
-    np.testing.assert_allclose(middle, fixes, atol=0.05)
+    np.testing.assert_allclose(middle, np.mean(fixes, axis=0), atol=0.05)
