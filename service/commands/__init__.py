@@ -11,13 +11,16 @@ from dataclasses import MISSING, fields
 from inspect import Parameter, Signature
 from pathlib import Path
 from threading import Event
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
 from service.errors import InputError
 from service.progress import Progress
 from service.workers import PROCESS
+
+if TYPE_CHECKING:
+    from service.config import Config
 
 QUIET_S = 2.0
 """After so long without a line a reader asks whether it still works."""
@@ -84,6 +87,21 @@ def one_of(action: str, actions: Sequence[str], command: str) -> None:
     """InputError for an action that the command does not have."""
     if action not in actions:
         raise InputError(f"{command} {action}: there are {', '.join(actions)}")
+
+
+def check_names(chosen: "Config", where: str) -> None:
+    """Raise InputError for a link, camera or backend that no machine can open."""
+    from mavlink.wire.ports import parse_link
+    from service.cameras import parse_source
+
+    try:
+        for link in chosen.mavlink.links:
+            parse_link(link)
+        if ":" in chosen.camera.source:  # a file may come later
+            parse_source(chosen.camera.source)
+    except (InputError, ValueError) as error:
+        raise InputError(f"{where}: {error}") from error
+    one_of(chosen.compute.backend, BACKENDS, f"{where}: compute.backend")
 
 
 def parse_size(text: str) -> tuple[int, int]:

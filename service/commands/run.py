@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from service.commands import ConfigFile, Overrides, on_signals
+from service.commands import ConfigFile, Overrides, check_names, on_signals
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,6 +97,7 @@ def reread(
     with _reloads:
         try:
             wanted = load_config(path, overrides)
+            check_names(wanted, f"{path}")
             daemon.reload(wanted if flight is None else flight.configured(wanted))
         except InputError as error:
             log.error("the configuration is unchanged: %s", error)

@@ -10,9 +10,17 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ConfigFile, Overrides, choices, one_of, showing
-from service.config import Config, load_config
+from service.commands import (
+    AsJson,
+    ConfigFile,
+    Overrides,
+    check_names,
+    choices,
+    one_of,
+    showing,
+)
 from service.config import keys as configuration_keys
+from service.config import load_config
 from service.errors import InputError, OutsideError
 from service.redaction import HIDDEN, public_configuration
 
@@ -36,7 +44,7 @@ def config(
         raise InputError("config check: name the file to check")
     chosen = load_config(file, set_ or [])
     if action == "check":
-        _check_names(chosen, f"{file}")
+        check_names(chosen, f"{file}")
     values = chosen.to_dict()
     if action == "show":
         values = public_configuration(values)
@@ -48,22 +56,6 @@ def config(
         if values != chosen.to_dict():
             print(f"# {HIDDEN}: a secret, which is not shown")
         print(to_toml(values, documented=action == "default"), end="")
-
-
-def _check_names(chosen: Config, where: str) -> None:
-    """Raise InputError for a link, camera or backend that no machine can open."""
-    from mavlink.wire.ports import parse_link
-    from recon.backends import BACKENDS
-    from service.cameras import parse_source
-
-    try:
-        for link in chosen.mavlink.links:
-            parse_link(link)
-        if chosen.camera.source:
-            parse_source(chosen.camera.source)
-    except (InputError, ValueError) as error:
-        raise InputError(f"{where}: {error}") from error
-    one_of(chosen.compute.backend, ("auto", *BACKENDS, "onnx"), f"{where}: compute.backend")
 
 
 def to_toml(values: Mapping[str, Mapping[str, Any]], documented: bool = False) -> str:

@@ -229,6 +229,18 @@ def test_a_parameter_that_is_set_during_a_reload_stands(tmp_path: Path) -> None:
     assert scanning.config.scan.resolution_m == 0.25
 
 
+@pytest.mark.parametrize(
+    "wrong", ["[mavlink]\nlinks = ['udp:14550']", "[camera]\nsource = 'rstp://a/b'"]
+)
+def test_a_reload_that_no_restart_could_use_changes_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, wrong: str
+) -> None:
+    path, daemon = tmp_path / "sr.toml", Mock()
+    path.write_text(wrong)
+    reread(daemon, None, path, [])
+    assert not daemon.reload.called and f"unchanged: {path}: " in caplog.text
+
+
 def test_of_two_reloads_the_newest_file_counts(tmp_path: Path) -> None:
     """Each runs on a thread of its own: the earlier one put its older file in force last."""
     path, in_force = tmp_path / "sr.toml", list[float]()
