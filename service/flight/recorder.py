@@ -280,7 +280,7 @@ class Recorder:
     def _write_keyframes(self, events: Iterable[Event]) -> None:
         ready = [event for event in events if isinstance(event, KeyframeReady)]
         for first in (event.keyframe for event in ready if event.is_first_depth):
-            coarse, *_ = encode(first, first.time_ns + self._offset_ns)
+            (coarse,) = encode(first, first.time_ns + self._offset_ns, is_coarse_enough=True)
             self.store.offer_first(first.seq, coarse)
         whole = [event for event in ready if not event.is_first_depth]
         if whole:

@@ -148,8 +148,11 @@ FINE_QUALITY, COARSE_QUALITY = 80, 25  # of JPEG, 1 to 100
 COARSE_WIDTH_PX = 80
 
 
-def encode(keyframe: Keyframe, time_unix_ns: int) -> tuple[bytes, ...]:
-    """The layers of ``keyframe``, coarse first; the last one holds everything.
+def encode(
+    keyframe: Keyframe, time_unix_ns: int, is_coarse_enough: bool = False
+) -> tuple[bytes, ...]:
+    """The layers of ``keyframe``, coarse first; the last one holds everything, and is left out
+    where the coarse one ``is_coarse_enough``.
 
     A keyframe no wider than COARSE_WIDTH_PX is one layer. Raises ValueError when the
     grid is empty, beyond MAX_SIDE_PX or MAX_PIXELS, or the arrays differ in size.
@@ -171,11 +174,10 @@ def encode(keyframe: Keyframe, time_unix_ns: int) -> tuple[bytes, ...]:
     layer = partial(_layer, keyframe, time_unix_ns)
     if factor == 1:
         return (layer(0, 1, 1, fine, FINE_RMS_M, FINE_QUALITY),)
-    coarse = planes.reduce(fine, factor)
-    return (
-        layer(0, 2, factor, coarse, COARSE_RMS_M, COARSE_QUALITY),
-        layer(1, 2, 1, fine, FINE_RMS_M, FINE_QUALITY),
-    )
+    coarse = layer(0, 2, factor, planes.reduce(fine, factor), COARSE_RMS_M, COARSE_QUALITY)
+    if is_coarse_enough:
+        return (coarse,)
+    return coarse, layer(1, 2, 1, fine, FINE_RMS_M, FINE_QUALITY)
 
 
 def _layer(

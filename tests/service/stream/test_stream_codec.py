@@ -111,6 +111,7 @@ def test_colour_is_close() -> None:
 def test_coarse_layer_stands_alone_on_the_same_surface() -> None:
     frame = keyframe()
     coarse_bytes, fine_bytes = encode(frame, 0)
+    assert encode(frame, 0, is_coarse_enough=True) == (coarse_bytes,)
     assert len(coarse_bytes) <= 0.1 * (len(coarse_bytes) + len(fine_bytes))
     coarse = decode([coarse_bytes])
     assert coarse is not None and coarse.depth.depth_m.shape == (45, 80)
