@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import skyrelief
 from house_flight import HouseFlight
 from loopback import until
 from portal_client import TOKEN, flown_store
@@ -115,6 +116,23 @@ def test_meshes_that_did_not_fit_or_were_cut_off_are_made_later(
         assert not (folder / "mesh.glb").exists()
     finally:
         second.close()
+
+
+def test_a_scan_that_ended_without_a_portal_gets_its_mesh_by_a_later_one(
+    folder: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("zenoh")
+    for options, due in (
+        ("--no-meshes", []),
+        ("--meshes", [tmp_path / "kept/drones/drone-1/test-1"]),
+    ):
+        store = tmp_path / ("kept" if due else "none")
+        ended = skyrelief(
+            "ground", "--listen", "tcp/127.0.0.1:0", "--store", store, "--no-sites", options,
+            "--take", folder, "--idle-exit-s", "0",
+        )  # fmt: skip
+        assert ended.returncode == 0, ended.stderr
+        assert MESH.folders(store) == due
 
 
 def test_a_mesh_stays_that_of_its_scan_when_it_is_imported(folder: Path, tmp_path: Path) -> None:
