@@ -255,9 +255,10 @@ class Scan:
         Frames that come while ``paused`` is set are passed over. A recording is decoded ahead.
         """
         live = self.source.is_live
+        quiet = short_collections() if live else nullcontext()  # stops do a replay no harm
         coverage = covering(self.store) if live else nullcontext()
         source = nullcontext(self.source) if live else closing(ahead(self.source))
-        with short_collections(), coverage, source as frames:
+        with quiet, coverage, source as frames:
             for frame in frames:
                 if stop.is_set():
                     log.info("stopped; closing the scan")
