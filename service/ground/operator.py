@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from mavlink.wire.ports import parse_link
 from service.errors import InputError, OutsideError
 from service.packages import needing
 
@@ -67,6 +68,17 @@ class Ack:
         return RESULTS[self.result] if self.result < len(RESULTS) else f"result {self.result}"
 
 
+def mavsdk_url(link: str) -> str:
+    """A link in the notation of ``mavlink.links`` as mavsdk writes it; any other as it is."""
+    if "://" in link:
+        return link
+    try:
+        spec = parse_link(link)
+    except ValueError:
+        return link
+    return f"{'tcpout' if spec.kind == 'tcp' else spec.kind}://{spec.place}:{spec.number}"
+
+
 class Operator:
     """A connection to one vehicle with our companion on it; use it in a ``with``."""
 
@@ -96,7 +108,7 @@ class Operator:
     def _connect(self, endpoint: str) -> None:
         from mavsdk import ConnectionResult
 
-        result = self._mavsdk.add_any_connection(endpoint)
+        result = self._mavsdk.add_any_connection(mavsdk_url(endpoint))
         if result != ConnectionResult.SUCCESS:
             raise InputError(
                 f"{endpoint}: no connection ({getattr(result, 'name', result)}); "

@@ -19,6 +19,7 @@ from rehearsal import RehearsalVehicle
 from mavlink.component.camera import KeyframeReport
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
+from service.ground.operator import mavsdk_url
 
 
 def run_ctl(port: int, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -94,6 +95,21 @@ def test_ctl_says_when_none_or_the_wrong_one_answers() -> None:
         wrong = run_ctl(port, "pause")
         assert wrong.returncode == 3
         assert "component 1 of system 1 answered (accepted) instead" in wrong.stderr
+
+
+@pytest.mark.parametrize(
+    ("link", "url"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin://0.0.0.0:14550"),
+        ("tcp:10.0.0.1:5760", "tcpout://10.0.0.1:5760"),
+        ("serial:/dev/ttyUSB0:57600", "serial:///dev/ttyUSB0:57600"),
+        ("/dev/ttyUSB0", "serial:///dev/ttyUSB0:57600"),
+        ("serial:///dev/ttyUSB0:57600", "serial:///dev/ttyUSB0:57600"),
+        ("nonsense", "nonsense"),
+    ],
+)
+def test_ctl_takes_links_as_the_configuration_does(link: str, url: str) -> None:
+    assert mavsdk_url(link) == url
 
 
 class Impostor:
