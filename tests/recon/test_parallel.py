@@ -166,3 +166,23 @@ def test_calls_within_calls_end(four: None) -> None:
 def test_an_exception_of_one_call_is_raised() -> None:
     with pytest.raises(ZeroDivisionError):
         parallel.run_parallel(lambda: 1, lambda: 1 // 0)
+
+
+def test_a_long_call_leaves_the_others_to_the_other_threads(four: None) -> None:
+    done = threading.Semaphore(0)
+
+    def long() -> bool:
+        return all(done.acquire(timeout=20.0) for _ in range(7))
+
+    assert parallel.run_parallel(long, *([done.release] * 7))[0]
+
+
+def test_after_a_fault_no_further_call_begins(four: None) -> None:
+    parallel.limit_threads(1)
+    begun: list[int] = []
+    try:
+        with pytest.raises(ZeroDivisionError):
+            parallel.run_parallel(lambda: begun.append(0), lambda: 1 // 0, lambda: begun.append(2))
+    finally:
+        parallel.limit_threads(0)
+    assert begun == [0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
+from spied import spied
 
 from recon import se3
 from recon.types import F64
@@ -301,6 +303,18 @@ def test_a_large_site_is_fused_strip_by_strip_to_the_same_cloud(
         np.testing.assert_array_equal(getattr(strips.cloud, name), getattr(whole.cloud, name))
     assert coarse.voxel_m == pytest.approx(2 * whole.voxel_m)
     assert "enlarged" in coarse.notes[0]
+
+
+def test_fusion_decodes_a_keyframe_for_its_points_and_for_what_it_sees(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.scans.fused_cloud.MIN_STRIP_POINTS", 1)
+    with house.flown(tmp_path) as store:
+        decoded = spied(monkeypatch, store, "keyframe")
+        fused_cloud(store)
+        assert Counter(call.args[0] for call in decoded.call_args_list) == dict.fromkeys(
+            store.seqs(), 2
+        )
 
 
 def test_strips_hold_equal_shares() -> None:
