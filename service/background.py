@@ -7,6 +7,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, wait
+from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
 from threading import Condition, Event
@@ -130,6 +131,17 @@ class BackgroundWorker(Generic[In, Out]):
         nothing waits longer."""
         self._ends, self._patience_s = event, patience_s
 
+    def prepare(self, load: Callable[[], object]) -> None:
+        """Call ``load()`` on the first thread, if there is one, before the next item."""
+
+        def job() -> Callable[[], object]:
+            with suppress(Exception):  # the work that needs it will say so
+                load()
+            return bool
+
+        if self._halves:
+            self._halves[0].todo.put(job)
+
     def offer(self, item: In) -> None:
         if self._ends.is_set():
             self.dropped += self._counts(item)
@@ -182,7 +194,7 @@ class BackgroundWorker(Generic[In, Out]):
 
     def _begin(self, future: Future[Out]) -> Callable[[], object]:
         if not future.set_running_or_notify_cancel():
-            return bool  # nothing to pass on
+            return bool  # there is nothing to pass on
         try:
             rest = self._work(self._offered[future])
         except Exception as error:  # raised where the result is taken

@@ -208,7 +208,6 @@ def fly(
 
     What came before that is wrong, so such a scan is discarded, unless it goes to the ground.
     """
-    from recon.parallel import pool
     from service.commands.missing_metadata import correction_of
     from service.daemon.warm_up import has_kernels, load_kernels
     from service.flight.datalink import open_datalink
@@ -227,7 +226,7 @@ def fly(
         if not has_kernels():
             work = f"compiling kernels, once, a minute or two; {work}"
         elif inputs.backend.name == "cpu":
-            pool().submit(load_kernels)  # the first view is some frames away
+            scan.worker.prepare(load_kernels)  # the first view is some frames away
         with progress.part(work, of_rest=0.9):
             show = show_flown(inputs.source, progress)
             scan.run(stop, show, is_enough=lambda scan: correction_of(scan, unsure))

@@ -63,6 +63,16 @@ def test_the_first_half_of_the_next_goes_on_beside_the_second() -> None:
     jobs.close()
 
 
+def test_what_prepares_the_work_is_done_before_it() -> None:
+    done: list[int] = []
+    jobs = BackgroundWorker(ROWS, halves(done.append), 2)
+    jobs.prepare(lambda: done.append(7))
+    jobs.prepare(lambda: 1 // 0)
+    jobs.offer(1)
+    assert jobs.finished(everything=True) == [(1, None)] and done == [7, 1]
+    jobs.close()
+
+
 def test_a_fault_of_a_second_half_reaches_the_caller() -> None:
     def work(n: int) -> Callable[[], float]:
         return lambda: 1 / n
