@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -92,6 +92,7 @@ class ImagesSource(CameraSource):
         tagged = [(path, self._as_used(tags)) for path, tags in tagged]
         order = sorted(range(len(tagged)), key=lambda i: (times[i], i))
         self._stills = [(*tagged[i], times[i]) for i in order]
+        self._flights()
         self.size_px = stored[::-1] if self.turned_deg % 180 else stored
         self.lens = next(tags.lens for _, tags in tagged if tags.size_px == stored)
         self.camera = (
@@ -319,6 +320,16 @@ class ImagesSource(CameraSource):
         if wild:
             self._warn(f"{len(wild)} positions are far off all others: not used")
         return without(tagged, lambda tag: id(tag) in wild, lat_deg=None, lon_deg=None)
+
+    def _flights(self) -> None:
+        """A warning where more time lies between two stills than within a flight."""
+        longest_ns = ONE_FLIGHT_S * SECOND_NS
+        first = [b for a, b in pairwise(self._stills) if b[2] - a[2] > longest_ns]
+        if first:
+            self._warn(
+                f"the images are of {len(first) + 1} flights, the second from {first[0][0].name} "
+                "on: one scan of all; of other places or days give each flight its own folder"
+            )
 
     def _turn(self, tagged: list[Still]) -> int:
         """Rotation in degrees clockwise for all stills, by their tags.

@@ -375,7 +375,11 @@ def test_a_position_of_another_day_is_not_used(tmp_path: Path) -> None:
     source = open_camera(str(tmp_path))
     tags = [frame.geotag for frame in source]
     assert [tag is not None and tag.lat_deg is not None for tag in tags] == [False] * 2 + [True] * 6
-    assert source.warnings == ["2 positions are far off all others: not used"]
+    assert source.warnings == [
+        "2 positions are far off all others: not used",
+        "the images are of 2 flights, the second from 6.jpg on: one scan of all; of other places "
+        "or days give each flight its own folder",
+    ]
 
 
 def test_stills_that_no_library_decodes_are_named_with_the_remedy(tmp_path: Path) -> None:
