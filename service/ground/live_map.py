@@ -1,7 +1,8 @@
 """The map of a scan while it grows, as Web Mercator tiles drawn from its keyframes.
 
 A tile keeps the keyframes that it was drawn from: a new one is drawn into it, one that moved or
-became finer makes it again. Each pixel has the height and the colour of its surest point.
+became finer makes it again. Each pixel has the height and the colour of its surest point. Where
+nothing is measured inside of what is, as around crowns, it has the colour that images show.
 """
 
 from __future__ import annotations
@@ -9,20 +10,22 @@ from __future__ import annotations
 import math
 import time
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
-from recon.mapping.cloud_fusion import cloud_of
+from recon.mapping.cloud_fusion import cloud_of, joined
 from recon.mapping.voxel_map import ground_sample_m
 from recon.surface.raster import Grid, Raster, fill_holes
-from recon.types import F32, F64, U8, Array, Keyframe
+from recon.types import F32, F64, U8, Array, Keyframe, PointCloud
 from service.errors import MissingError
 from service.georeference import LocalFrame
 from service.scans.drawing import exposure, values
 from service.scans.main_piece import main_seqs
 from service.scans.track import local_frame
+from service.stream.images import whole_bgr
 from service.stream.store import ScanStore
 
 SIDE, MARGIN = 256, 8
@@ -32,6 +35,13 @@ WIDE = SIDE + 2 * MARGIN
 EQUATOR_M = 2.0 * math.pi * 6378137.0
 MAX_ZOOM = 24
 HOLE_PX = 4
+GAP_PX = 12
+"""Of an image: what lies between measured pixels, up to twice so far apart, is shown."""
+
+UNMEASURED_M = 1e6
+"""Sigma of a place that images show and nothing measured, and one more for each pixel from there to
+a measured one: the nearest is shown."""
+
 MAX_TILES = 150
 
 Tile = tuple[int, int, int]
@@ -72,7 +82,7 @@ class _Points:
     """A keyframe's points, the surest last."""
 
     place: F64  # (N, 2) in the square of Web Mercator
-    height_m: F32
+    height_m: F32  # NaN where it is not measured
     sigma_m: F32
     rgb: U8
 
@@ -123,8 +133,11 @@ class LiveMap:
             if time.monotonic() > until:
                 return
 
-    def surface(self, tile: Tile) -> Raster:
-        """The known part of a tile, (WIDE, WIDE) with its margin, at a zoom up to :attr:`zoom`."""
+    def surface(self, tile: Tile, seen: bool = False) -> Raster:
+        """The measured part of a tile, (WIDE, WIDE) with its margin, at a zoom up to :attr:`zoom`.
+
+        With ``seen`` all that images show between, at height 0.
+        """
         drawn = self._tiles.pop(tile, None) or _Drawn()
         now = dict(self._within(tile))
         if any(now.get(seq) != state for seq, state in drawn.states.items()):
@@ -135,12 +148,14 @@ class LiveMap:
         self._tiles[tile] = drawn
         while len(self._tiles) > MAX_TILES:
             self._tiles.popitem(last=False)
+        height = drawn.height
+        if seen:
+            height = np.where(np.isfinite(drawn.sigma), 0.0, np.nan).astype(np.float32)
         shape = (WIDE, WIDE)
         grid = Grid(0.0, 0.0, pixel_m(tile[0], self._frame.lat_deg), shape)
         raster = Raster(
-            grid, drawn.height.reshape(shape), drawn.sigma.reshape(shape),
-            drawn.rgb.reshape(*shape, 3),
-        )  # fmt: skip
+            grid, height.reshape(shape), drawn.sigma.reshape(shape), drawn.rgb.reshape(*shape, 3)
+        )
         return fill_holes(raster, HOLE_PX)
 
     def _within(self, tile: Tile) -> list[tuple[int, State]]:
@@ -170,7 +185,7 @@ class LiveMap:
         """(4,) bounds of a keyframe's points; NaN without any."""
         points = self._points(seq, state)
         place = points.place
-        self._values[seq] = values(points.rgb)
+        self._values[seq] = values(points.rgb[np.isfinite(points.height_m)])
         if not len(place):
             return np.full(4, np.nan)
         return np.concatenate([place.min(axis=0), place.max(axis=0)])
@@ -182,11 +197,16 @@ class LiveMap:
             return _Points(np.zeros((0, 2)), empty, empty, np.zeros((0, 3), np.uint8))
         self._choose_zoom(keyframe)
         cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
+        image = self._store.image(seq)
+        if image is not None and len(cloud):
+            cloud = joined([cloud, unmeasured(keyframe, image)])
         order = np.argsort(-cloud.sigma_m)
-        place = on_map(self._frame, cloud.xyz_m[order].astype(np.float64))
-        return _Points(
-            place[:, :2], place[:, 2].astype(np.float32), cloud.sigma_m[order], cloud.rgb[order]
+        place, sigma = (
+            on_map(self._frame, cloud.xyz_m[order].astype(np.float64)),
+            cloud.sigma_m[order],
         )
+        height = np.where(sigma < UNMEASURED_M, place[:, 2], np.nan).astype(np.float32)
+        return _Points(place[:, :2], height, sigma, cloud.rgb[order])
 
     def _choose_zoom(self, keyframe: Keyframe) -> None:
         sample_m = ground_sample_m(keyframe.depth)
@@ -194,6 +214,26 @@ class LiveMap:
             lat = self._frame.lat_deg
             finest = math.floor(math.log2(pixel_m(0, lat) / max(sample_m, 1e-3)))
             self.zoom = min(max(finest, 0), MAX_ZOOM)
+
+
+def unmeasured(keyframe: Keyframe, image: bytes) -> PointCloud:
+    """The pixels between measured ones, in the colours of the keyframe's ``image`` (JPEG), at the
+    depth of the nearest measured one."""
+    from scipy import ndimage
+
+    depth = keyframe.depth
+    known = np.isfinite(depth.depth_m) & keyframe.fresh
+    size = 2 * GAP_PX + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    padded = np.pad(known, GAP_PX).astype(np.uint8)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[GAP_PX:-GAP_PX, GAP_PX:-GAP_PX]
+    inside = ndimage.binary_fill_holes(closed) & ~known
+    distance, near = ndimage.distance_transform_edt(~known, return_indices=True)
+    filled = replace(
+        depth, depth_m=depth.depth_m[tuple(near)], sigma_m=np.zeros_like(depth.sigma_m)
+    )
+    cloud = cloud_of(filled, whole_bgr(keyframe, image), inside)
+    return replace(cloud, sigma_m=(UNMEASURED_M + distance[inside]).astype(np.float32))
 
 
 def _corner(tile: Tile) -> F64:

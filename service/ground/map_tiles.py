@@ -135,7 +135,7 @@ def tile_image(state: PortalState, folder: Path, layer: str, tile: Tile) -> U8:
         live = state.maps.view(folder)
         up = max(0, tile[0] - (tile[0] if live.zoom is None else live.zoom))
         parent = tile[0] - up, tile[1] >> up, tile[2] >> up
-        surface = live.surface(parent)
+        surface = live.surface(parent, seen=layer == "ortho")
     return _enlarged(_drawn(layer, surface), tile, up, smooth=layer != TERRAIN)
 
 

@@ -24,6 +24,7 @@ from service.ground.live_map import LiveMap, degrees, mercator, on_map, pixel_m
 from service.ground.map_tiles import contour_mask, interval_m
 from service.ground.state import OpenScans
 from service.stream.codec import encode
+from service.stream.images import encode_image
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
@@ -154,6 +155,25 @@ def test_the_surest_point_of_a_place_is_shown(store: Path, house: HouseFlight) -
         shown = [at(client, "ortho", place)[:3].tolist() for place in (ROOF, GROUND)]
     assert np.abs(np.subtract(shown[0], (255, 255, 0))).max() < 12
     assert shown[1][0] < 200  # where the sure one does not reach the others still hold
+
+
+def test_what_nothing_measured_has_the_colour_of_the_image_and_no_height(
+    store: Path, house: HouseFlight
+) -> None:
+    """Crowns of trees, to which stereo gives no depth, are no white blobs."""
+    east, crown_bgr = 300.0, (30, 220, 240)
+    one = house.keyframe(5, east)
+    rows, cols = slice(35, 55), slice(70, 90)
+    one.depth.depth_m[rows, cols] = np.nan
+    one.bgr[rows, cols] = crown_bgr
+    with ScanStore.open(store / "drone-1/test-1/scan.db") as scan:
+        scan.add_keyframe(5, encode(one, one.time_ns), encode_image(one.bgr))
+    with serving(store) as client:
+        assert np.abs(at(client, "ortho", (east, 0.0))[:3].astype(int) - crown_bgr).max() < 40
+        assert at(client, "ortho", (east, 0.0))[3] == 255
+        assert at(client, "terrain", (east, 0.0))[3] == 0
+        assert at(client, "dsm", (east, 0.0))[3] == 0
+        assert at(client, "ortho", NOWHERE)[3] == 0
 
 
 def test_shading_and_contours_show_the_walls_alone(client: Client) -> None:

@@ -2,6 +2,7 @@
 // them, in the colours of the points. So there is no hole where nothing was seen.
 
 import * as THREE from "three";
+import { SHADE, shows } from "./shade";
 import { DRAWN_BEHIND } from "./surface";
 
 const CELLS = 256; // along the longer side
@@ -30,17 +31,23 @@ const VERTEX = /* glsl */ `
     #include <clipping_planes_vertex>
   }
 `;
-const fragment = (shade: string): string => /* glsl */ `
+const FRAGMENT = /* glsl */ `
   varying vec4 shown;
   varying vec3 where;
   #include <clipping_planes_pars_fragment>
-  ${shade}
+  ${SHADE}
   void main() {
     #include <clipping_planes_fragment>
     float noise = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715))));
     if (shown.a <= noise) discard;  // fades without the sky behind taking part in exposure
-    vec3 rgb = mode < 1.5 ? shade(where, shown.rgb, 0.0, 0.0) : vec3(0.08 + dot(shown.rgb, vec3(0.21, 0.72, 0.07)));
-    gl_FragColor = vec4((mode < 0.5 ? 1.0 : float(${FIGURES})) * rgb, 0.0); // not measured
+    #if ${shows("colour")}
+      vec3 rgb = shown.rgb;
+    #elif ${shows("height")}
+      vec3 rgb = float(${FIGURES}) * shade(where, shown.rgb, 0.0, 0.0);
+    #else
+      vec3 rgb = vec3(float(${FIGURES}) * (0.08 + dot(shown.rgb, vec3(0.21, 0.72, 0.07))));
+    #endif
+    gl_FragColor = vec4(rgb, 0.0); // not measured
     #include <colorspace_fragment>
   }
 `;
@@ -202,10 +209,10 @@ function smooth(z: Float32Array, rgb: Float32Array, known: Uint8Array, alpha: Fl
 export class Ground {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
 
-  constructor(uniforms: Record<string, THREE.IUniform>, shade: string) {
+  constructor(uniforms: Record<string, THREE.IUniform>, defines: Record<string, number>) {
     const material = new THREE.ShaderMaterial({
-      uniforms,
-      vertexShader: VERTEX, fragmentShader: fragment(shade), clipping: true, side: THREE.DoubleSide,
+      uniforms, defines,
+      vertexShader: VERTEX, fragmentShader: FRAGMENT, clipping: true, side: THREE.DoubleSide,
     });
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), material);
     this.mesh.raycast = () => undefined; // it is not measured

@@ -2,18 +2,16 @@
 
 import * as THREE from "three";
 import type { Part } from "./api";
-import { Before, CHANGE } from "./before";
+import { Before } from "./before";
 import { type Chunk, EDGE_PX, FIRST, isVoid, sigmaAt, viewsAt } from "./depth";
 import { Ground, type Samples } from "./fill";
 import type { Gradual } from "./painter";
+import { type Colour, COLOURS, SHADE } from "./shade";
 import { BEHIND, LEVELS, Surface } from "./surface";
 import { length } from "./units";
 
 /** Between the keyframes' numbers of two scans that are drawn together. */
 export const STRIDE = 2 ** 33;
-
-export const COLOURS = ["colour", "height", "sigma", "views", "age", "scan", "change"] as const;
-export type Colour = (typeof COLOURS)[number];
 
 /** Distinct also for the colour-blind (Okabe and Ito 2008). */
 const PARTS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7"];
@@ -31,38 +29,6 @@ const GROUND_MS = 1500; // between two of them
 const SAMPLED = 40_000; // values that a range of colours is of: it is found again while the scan grows
 const NEWEST = 5; // keyframes that show how far the camera looks
 const MAX_TRIANGLES = 12_000_000; // in memory
-
-/** GLSL: the colour that a place is shown in; linear, as `rgb`. */
-const SHADE = /* glsl */ `
-  uniform float mode;
-  uniform vec2 range;
-  uniform float age;
-  uniform vec3 part;
-  uniform vec3 higher, lower, same, unseen;
-  ${CHANGE}
-  vec3 linear(vec3 s) {
-    return mix(s / 12.92, pow((s + 0.055) / 1.055, vec3(2.4)), step(0.04045, s));
-  }
-  vec3 ramp(float t) {
-    t = clamp(t, 0.0, 1.0);
-    vec3 low = mix(vec3(0.27, 0.0, 0.33), vec3(0.13, 0.57, 0.55), min(2.0 * t, 1.0));
-    return linear(mix(low, vec3(0.99, 0.91, 0.14), max(2.0 * t - 1.0, 0.0)));
-  }
-  vec3 shade(vec3 world, vec3 rgb, float sigma_m, float views) {
-    if (mode < 0.5) return rgb;
-    float gray = pow(max(dot(rgb, vec3(0.21, 0.72, 0.07)), 0.0), 0.4545);
-    if (mode > 5.5) {
-      float d = change(world, 0.15 + 3.0 * sigma_m);
-      vec3 kind = d > 1e8 ? unseen : mix(same, d > 0.0 ? higher : lower, min(abs(d) / 0.3, 1.0));
-      return kind * (0.4 + 0.6 * gray);
-    }
-    if (mode > 4.5) return part * (0.3 + 0.7 * gray);
-    if (mode > 3.5) return ramp(age);
-    if (mode > 2.5) return ramp(views / 8.0);
-    if (mode > 1.5) return ramp(sigma_m / max(range.y, 0.01));
-    return ramp((world.z - range.x) / max(range.y - range.x, 0.01));
-  }
-`;
 
 const VERTEX = /* glsl */ `
   #define SIGMA_M float(${MAX_SIGMA_M})
@@ -147,11 +113,12 @@ export class Cloud implements Gradual {
   private groundAt = -Infinity;
   private isNew = false; // what came last was in no frame yet: that is first
   private scaledAt = -Infinity;
+  private mode: Colour = "colour";
+  private readonly defines = { MODE: 0 };
   private readonly shared = {
     size: { value: 1.3 },
     thin: { value: 1 },
     height_px: { value: 400 },
-    mode: { value: 0 },
     behind: { value: 0 },
     range: { value: new THREE.Vector2(0, 1) },
     ...this.before.uniforms,
@@ -159,7 +126,7 @@ export class Cloud implements Gradual {
   };
 
   /** What lies below the surfaces; not measured. */
-  readonly ground = new Ground(this.shared, SHADE);
+  readonly ground = new Ground(this.shared, this.defines);
 
   get total(): number {
     let sum = 0;
@@ -206,12 +173,13 @@ export class Cloud implements Gradual {
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
+      defines: this.defines,
       clipping: true,
       uniforms: { ...this.shared, ...own, apart: { value: 1 / chunk.K[0] } },
     });
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
-    const surface = new Surface(chunk, { ...this.shared, ...own }, SHADE);
+    const surface = new Surface(chunk, { ...this.shared, ...own }, this.defines);
     const held: Held = { object, surface, shown: true, unit_m, points: sigma.length, layer: chunk.layer, values: rgb.slice(0, 600), time: chunk.time_unix_s, T: chunk.T, scale: chunk.scale };
     this.chunks.set(chunk.seq, held);
     this.place(chunk.seq, held);
@@ -234,7 +202,7 @@ export class Cloud implements Gradual {
   brightness = 1;
 
   private get showsFigures(): boolean {
-    return this.group.visible && this.shared.mode.value > 0;
+    return this.group.visible && this.mode !== "colour";
   }
 
   /** What colours are shown with: the exposure, but for those of figures. */
@@ -326,14 +294,14 @@ export class Cloud implements Gradual {
     }
     const isRescaled = this.isUnscaled && this.showsFigures && performance.now() - this.scaledAt > GROUND_MS;
     if (isRescaled) {
-      this.colour(COLOURS[this.shared.mode.value]!);
+      this.colour(this.mode);
       this.scaled();
     }
     return this.compare() || grew || isRescaled;
   }
 
   private compare(): boolean {
-    if (!this.isStale || COLOURS[this.shared.mode.value] !== "change") return false;
+    if (!this.isStale || this.mode !== "change") return false;
     this.isStale = false;
     this.before.build(this.past);
     return true;
@@ -395,10 +363,17 @@ export class Cloud implements Gradual {
   colour(mode: Colour): void {
     this.isUnscaled = false;
     this.scaledAt = performance.now();
-    this.shared.mode.value = COLOURS.indexOf(mode);
+    if (mode !== this.mode) this.compile(mode);
     if (mode === "height") this.heightScale();
     if (mode === "sigma") this.sigmaScale();
     if (mode === "age") this.ages();
+  }
+
+  private compile(mode: Colour): void {
+    this.mode = mode;
+    this.defines.MODE = COLOURS.indexOf(mode);
+    this.ground.mesh.material.needsUpdate = true;
+    for (const { object, surface } of this.chunks.values()) object.material.needsUpdate = surface.mesh.material.needsUpdate = true;
   }
 
   /** True for a colour that has something to show. */
@@ -408,9 +383,8 @@ export class Cloud implements Gradual {
 
   /** The name and colour of each part or kind of change; none for other colours. */
   keys(): [string, string][] {
-    const mode = COLOURS[this.shared.mode.value];
-    if (mode === "change") return CHANGES;
-    return mode !== "scan" ? [] : this.parts.map(({ name }, k) => [name, PARTS[k % PARTS.length]!]);
+    if (this.mode === "change") return CHANGES;
+    return this.mode !== "scan" ? [] : this.parts.map(({ name }, k) => [name, PARTS[k % PARTS.length]!]);
   }
 
   private partOf(seq: number): THREE.Color {
@@ -430,7 +404,7 @@ export class Cloud implements Gradual {
       scan: null,
       change: null,
     };
-    return words[COLOURS[this.shared.mode.value]!];
+    return words[this.mode];
   }
 
   /** Diameter of a point in distances to its neighbour; 1 closes the surface just so. */

@@ -3,6 +3,7 @@
 
 import * as THREE from "three";
 import { type Chunk, EDGE_PX, FIRST, sigmaAt, viewsAt } from "./depth";
+import { SHADE } from "./shade";
 
 /** Pixels of the depth image between two vertices, by level. */
 const STEPS = [1, 2, 4, 8, 16];
@@ -66,14 +67,14 @@ const VERTEX = /* glsl */ `
   }
 `;
 
-const fragment = (shade: string): string => /* glsl */ `
+const FRAGMENT = /* glsl */ `
   uniform sampler2D image;
   varying vec2 place;
   varying vec3 where;
   varying vec2 sure;
   varying float measured;
   #include <clipping_planes_pars_fragment>
-  ${shade}
+  ${SHADE}
   void main() {
     #include <clipping_planes_fragment>
     gl_FragColor = vec4(shade(where, texture2D(image, place).rgb, sure.x, sure.y), measured);
@@ -95,7 +96,7 @@ export class Surface {
   private readonly levels: (THREE.BufferGeometry | undefined)[] = [];
   private readonly sphere: THREE.Sphere;
 
-  constructor(private readonly chunk: Chunk, uniforms: Record<string, THREE.IUniform>, shade: string) {
+  constructor(private readonly chunk: Chunk, uniforms: Record<string, THREE.IUniform>, defines: Record<string, number>) {
     const { K, low, step, box, colour } = chunk;
     let known = 0;
     for (const code of chunk.codes) known += code ? 1 : 0;
@@ -107,7 +108,8 @@ export class Surface {
     texture.needsUpdate = colour !== null;
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
-      fragmentShader: fragment(shade),
+      fragmentShader: FRAGMENT,
+      defines,
       clipping: true,
       side: THREE.DoubleSide,
       uniforms: {

@@ -9,7 +9,8 @@ import { coverageKeys, key } from "./keys";
 import { filmBox } from "./film";
 import type { Ruler } from "./measure";
 import type { Notes } from "./notes";
-import { COLOURS, type Cloud, type Colour, type Layer } from "./points";
+import type { Cloud, Layer } from "./points";
+import { type Colour, COLOURS } from "./shade";
 import type { Stage } from "./stage";
 import * as units from "./units";
 
