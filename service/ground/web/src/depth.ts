@@ -27,7 +27,7 @@ export interface Chunk extends Head {
   /** Views of 2x2 pixels; empty: one. */
   views: Uint8Array;
   /** Of the box and of EDGE_PX around it: as measured where that is known, else as the whole keyframe's image shows it. */
-  colour: ImageBitmap | null;
+  colour: ImageData | null;
   /** There is such an image. */
   isWhole: boolean;
 }
@@ -76,22 +76,22 @@ const opened = (jpeg: Bytes): Promise<ImageBitmap> =>
   createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }), { colorSpaceConversion: "none", premultiplyAlpha: "none" });
 
 /** The colours of the box and its edge: the layer's own are noise where nothing is new. */
-function completed({ box, size }: Head, codes: Uint32Array, own: ImageBitmap, whole: ImageBitmap | null): ImageBitmap {
+function completed({ box, size }: Head, codes: Uint32Array, own: ImageBitmap, whole: ImageBitmap | null): ImageData {
   const [x, y, w, h] = box;
   const [across, down] = [w + 2 * EDGE_PX, h + 2 * EDGE_PX];
   const context = new OffscreenCanvas(across, down).getContext("2d", { willReadFrequently: true })!;
   context.drawImage(own, EDGE_PX, EDGE_PX);
-  if (whole) {
-    const measured = context.getImageData(EDGE_PX, EDGE_PX, w, h).data;
-    context.imageSmoothingQuality = "high";
-    context.drawImage(whole, EDGE_PX - x, EDGE_PX - y, size[0], size[1]);
-    const all = context.getImageData(EDGE_PX, EDGE_PX, w, h);
-    for (let i = 0; i < codes.length; i++) if (codes[i]) all.data.set(measured.subarray(4 * i, 4 * i + 3), 4 * i);
-    context.putImageData(all, EDGE_PX, EDGE_PX);
-    whole.close();
-  }
   own.close();
-  return context.canvas.transferToImageBitmap();
+  const measured = context.getImageData(0, 0, across, down);
+  if (!whole) return measured;
+  context.imageSmoothingQuality = "high";
+  context.drawImage(whole, EDGE_PX - x, EDGE_PX - y, size[0], size[1]);
+  whole.close();
+  const all = context.getImageData(0, 0, across, down);
+  const [from, to] = [measured, all].map(({ data }) => new Uint32Array(data.buffer)) as [Uint32Array, Uint32Array];
+  for (let i = 0, at = EDGE_PX * across + EDGE_PX; i < codes.length; at += across - w)
+    for (const end = i + w; i < end; i++, at++) if (codes[i]) to[at] = from[at]!;
+  return all;
 }
 
 async function inflated(data: Uint8Array<ArrayBuffer>): Promise<Uint8Array> {

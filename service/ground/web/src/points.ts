@@ -561,38 +561,34 @@ function cost(seen: [Surface, number][], coarser: number): number {
 
 /** The points of a keyframe in its camera's frame, in `unit_m`; shuffled, so that any part is an even sample. */
 function pointsOf(chunk: Chunk): { xyz: Int16Array; rgb: Uint8Array; sigma: Uint8Array; views: Uint8Array; unit_m: number } {
-  const { codes, w, h, K, low, step, box, colour } = chunk;
-  const at: number[] = [];
-  for (let i = 0; i < codes.length; i++) if (codes[i]) at.push(i);
+  const { codes, w, K, low, step, box, colour } = chunk;
+  const at = new Uint32Array(codes.length);
+  let n = 0;
+  for (let i = 0; i < codes.length; i++) if (codes[i]) at[n++] = i;
   let seed = chunk.seq + 1;
-  for (let i = at.length - 1; i > 0; i--) {
+  for (let i = n - 1; i > 0; i--) {
     seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0;
     const j = Math.floor((seed / 2 ** 32) * (i + 1));
-    [at[i], at[j]] = [at[j]!, at[i]!];
+    const one = at[i]!;
+    at[i] = at[j]!;
+    at[j] = one;
   }
-  const n = at.length;
   const place = new Float32Array(3 * n);
-  let far = 1e-3;
-  at.forEach((i, k) => {
-    const [u, v] = [i % w, (i / w) | 0];
-    const z = 1 / (low + step * (codes[i]! - 1));
-    place.set([((box[0] + u - K[2]) / K[0]) * z, ((box[1] + v - K[3]) / K[1]) * z, z], 3 * k);
-  });
-  for (const value of place) far = Math.max(far, Math.abs(value));
-  const unit_m = far / 32767;
   const [rgb, sigma, views] = [new Uint8Array(3 * n), new Uint8Array(n), new Uint8Array(n)];
-  const pixels = colour && pixelsOf(colour, w, h);
-  at.forEach((i, k) => {
-    const [u, v] = [i % w, (i / w) | 0];
-    if (pixels) rgb.set(pixels.subarray(4 * i, 4 * i + 3), 3 * k);
+  let far = 1e-3;
+  for (let k = 0; k < n; k++) {
+    const [u, v] = [at[k]! % w, (at[k]! / w) | 0];
+    const z = 1 / (low + step * (codes[at[k]!]! - 1));
+    place[3 * k] = ((box[0] + u - K[2]) / K[0]) * z;
+    place[3 * k + 1] = ((box[1] + v - K[3]) / K[1]) * z;
+    place[3 * k + 2] = z;
+    for (let c = 0; c < 3; c++) {
+      far = Math.max(far, Math.abs(place[3 * k + c]!));
+      if (colour) rgb[3 * k + c] = colour.data[4 * ((v + EDGE_PX) * colour.width + u + EDGE_PX) + c]!;
+    }
     sigma[k] = Math.min(Math.round(sigmaAt(chunk, u, v) / SIGMA_STEP_M), 255);
     views[k] = viewsAt(chunk, u, v);
-  });
+  }
+  const unit_m = far / 32767;
   return { xyz: Int16Array.from(place, (value) => Math.round(value / unit_m)), rgb, sigma, views, unit_m };
-}
-
-function pixelsOf(image: ImageBitmap, w: number, h: number): Uint8ClampedArray {
-  const context = new OffscreenCanvas(w, h).getContext("2d", { willReadFrequently: true })!;
-  context.drawImage(image, -EDGE_PX, -EDGE_PX);
-  return context.getImageData(0, 0, w, h).data;
 }
