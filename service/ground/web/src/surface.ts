@@ -77,7 +77,8 @@ const FRAGMENT = /* glsl */ `
   ${SHADE}
   void main() {
     #include <clipping_planes_fragment>
-    gl_FragColor = vec4(shade(where, texture2D(image, place).rgb, sure.x, sure.y), measured);
+    // A level finer than the widest view of a pixel asks for: ground that lies aslant stays sharp.
+    gl_FragColor = vec4(shade(where, texture2D(image, place, -1.0).rgb, sure.x, sure.y), measured);
     #include <colorspace_fragment>
   }
 `;
@@ -104,7 +105,7 @@ export class Surface {
     const texture = new THREE.Texture(colour ?? undefined);
     texture.colorSpace = THREE.SRGBColorSpace;
     texture.flipY = false;
-    texture.anisotropy = 4;
+    texture.minFilter = THREE.LinearMipmapNearestFilter; // a smoother choice takes a third of a frame without a graphics card
     texture.needsUpdate = colour !== null;
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
@@ -184,7 +185,6 @@ export class Surface {
     (this.mesh.material.uniforms["image"]!.value as THREE.Texture).dispose();
     this.mesh.material.dispose();
     this.mesh.removeFromParent();
-    this.chunk.colour?.close();
   }
 
   private make(level: number): THREE.BufferGeometry {
