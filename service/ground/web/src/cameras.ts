@@ -48,6 +48,7 @@ export class Cameras {
   /** Shows or hides the frusta of the keyframes; the aircraft's stays. */
   toggle(): void {
     this.all.visible = !this.all.visible;
+    this.refresh();
   }
 
   /** A keyframe taken, or moved, at T (16 numbers, column by column); null: it is withdrawn. */
@@ -135,8 +136,9 @@ export class Cameras {
     this.image.visible = true;
   }
 
-  /** Draws the frusta again when keyframes came; call now and then. True when it did. */
+  /** Draws the frusta, while they are shown, again when keyframes came; call now and then. True when it did. */
   refresh(): boolean {
+    if (!this.shown) return false;
     let shown = 0;
     for (const seq of this.taken.keys()) shown += this.shows(seq) ? 1 : 0;
     if (!this.stale && shown === this.drawn) return false;
