@@ -25,7 +25,7 @@ from service.georeference import LocalFrame
 from service.scans.drawing import exposure, values
 from service.scans.main_piece import main_seqs
 from service.scans.track import local_frame
-from service.stream.images import whole_bgr
+from service.stream.codec import whole_bgr
 from service.stream.store import ScanStore
 
 SIDE, MARGIN = 256, 8

@@ -23,8 +23,7 @@ from service.georeference import LocalFrame
 from service.ground.live_map import LiveMap, degrees, mercator, on_map, pixel_m
 from service.ground.map_tiles import contour_mask, interval_m
 from service.ground.state import OpenScans
-from service.stream.codec import encode
-from service.stream.images import encode_image
+from service.stream.codec import encode, encode_image
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
