@@ -29,6 +29,7 @@ LONGEST_S = 120.0  # a service that has not taken over by then is dead: stop
 
 
 FIRST_DEVICE = 100  # from here on component ids are of cameras, gimbals, computers, receivers ...
+INAV = 250  # MAV_COMP_ID_SYSTEM_CONTROL, as which flight controllers with INAV send
 NOT_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, *range(31, 35), *range(36, 43), 44, 48, 49})
 """MAV_TYPE of antenna trackers, ground stations, onboard computers, gimbals, ADS-B, cameras,
 charging stations, FLARM, servos, Open Drone ID, batteries, parachutes, loggers, OSDs, IMUs, GPS,
@@ -40,7 +41,7 @@ def is_autopilot(component: int, heartbeat: Any) -> bool:
     return (
         heartbeat.autopilot != NO_AUTOPILOT
         and heartbeat.type not in NOT_VEHICLES
-        and 0 < component < FIRST_DEVICE
+        and (0 < component < FIRST_DEVICE or component == INAV)
     )
 
 

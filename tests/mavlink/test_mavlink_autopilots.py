@@ -22,7 +22,7 @@ def test_a_companion_type_is_never_the_autopilot(kind: int, component: int) -> N
     assert net.presence.autopilot is None and not net.presence.is_disarmed(0)
 
 
-@pytest.mark.parametrize("component", [100, 154, 158, 191, 195, 220, 250])
+@pytest.mark.parametrize("component", [100, 154, 158, 191, 195, 220, 249, 251])
 def test_a_device_that_calls_itself_a_vehicle_is_not_the_autopilot(component: int) -> None:
     net = Net()
     net.beat((1, component), QUADROTOR, GENERIC)
@@ -42,6 +42,15 @@ def test_a_generic_autopilot_is_one() -> None:
     net = Net()
     net.beat((4, 1), QUADROTOR, GENERIC, armed=True)
     assert net.presence.autopilot == (4, 1) and net.presence.is_armed
+
+
+def test_inav_is_an_autopilot_unless_there_is_another() -> None:
+    net = Net()
+    net.beat((1, 250), QUADROTOR, GENERIC, armed=True)
+    assert net.presence.autopilot == (1, 250) and net.presence.is_armed
+    net.beat((1, 1), armed=True)
+    net.beat((1, 250), QUADROTOR, GENERIC, armed=False)
+    assert net.presence.autopilot == (1, 1) and net.presence.is_armed
 
 
 def test_another_component_does_not_take_the_place_of_the_autopilot() -> None:
