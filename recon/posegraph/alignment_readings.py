@@ -180,14 +180,14 @@ class AlignmentReadings:
         self.sigma_turn[self.is_assumed, :2] = noise.of_tilts(
             self.sigma_turn[self.is_assumed, :2], self.tilt_s, attitude_s
         )
-        self.x = _stack([a.place_of_fix for a in fixed], (3,))
-        self.fix = _stack([a.prior.position_m for a in fixed], (3,))
+        self.x = _stack([a.place_of_fix for a in fixed], (3,))  # in the odometry
+        self.fix = _stack([a.prior.position_m for a in fixed], (3,))  # in the world
         self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.fix_s = _stack([a.time_s for a in fixed], ())
         self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
         self.sigma_fix, self.bias = noise.of_fixes(self.claimed, fix_s)
-        self.step = _stack([b.place - a.place for a, b, _ in moved], (3,))
-        self.way = _stack([metres for *_, (metres, _) in moved], (3,))
+        self.step = _stack([b.place - a.place for a, b, _ in moved], (3,))  # by vision
+        self.way = _stack([metres for *_, (metres, _) in moved], (3,))  # the same by velocity
         self.way_s = np.maximum(_stack([s for *_, (_, s) in moved], ()), MIN_WAY_S)
         self.way_end_s = _stack([b.time_s for _, b, _ in moved], ())
         self.sigma_speed = noise.of_travels(self.way_s)
@@ -195,7 +195,7 @@ class AlignmentReadings:
         self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
         self.has_heights = any(sigma < GUESSED_SHARE for _, sigma in heights)
         self.is_height_assumed = bool(heights) and not self.has_heights
-        self.log_ratio = _stack([h[0] for h in heights], ())
+        self.log_ratio = _stack([h[0] for h in heights], ())  # of telemetry's height to vision's
         thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
         self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
         three, single = len(turned) + len(fixed) + len(moved), len(heights)
