@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.types import U8
+from recon.types import U8, Array
 from service.cameras import UNREAD, how_to_convert, reject_options
 from service.cameras.exif import DEFAULT_SIGMA_H_M, Tags, read_tags
 from service.cameras.geo_file import geo_file_of, read_geo
@@ -38,6 +38,14 @@ AS_OFTEN = 0.9
 FEW_PIXELS = 0.1
 """Share of another camera's pixels below which one does not count: a zoom camera has up to four
 times as many as its wide one, and a thermal one a twelfth."""
+
+SHOWN, WIDER, LOOKED_AT = (0.5, 99.5), 0.5, 5
+"""Percentiles of the levels of a deep image, of 16 bits or floats, as thermal cameras write them,
+that are shown; the share of those that is shown beyond them on each side; and how many images
+tell."""
+
+WIDE = 1 << 15
+"""Where more levels of 16 bits are shown than these it is a photo, and all are."""
 
 MAX_PAN_DEG = 30.0
 """Gimbals follow the nose: where images head further off it than that, their heading is wrong, as
@@ -98,6 +106,8 @@ class ImagesSource(CameraSource):
         self.camera = (
             None if self.lens is None else turned(self.lens.camera(stored), self.turned_deg)
         )
+        self._some = [path for path, *_ in self._stills[:: 1 + len(self._stills) // LOOKED_AT]]
+        self._black_white: tuple[float, float] | None = None  # of deep images, once known
         span_s = (self._stills[-1][2] - self._stills[0][2]) / 1e9
         self.fps = (len(self._stills) - 1) / span_s if span_s > 0 else None
 
@@ -105,12 +115,49 @@ class ImagesSource(CameraSource):
         """Yield the stills that decode."""
         seq = 0
         for path, tags, time_ns in self._stills:
-            image = _load(path, tags.size_px, self._turned_deg(tags))
+            image = self._load(path, tags)
             if image is None or image.shape[:2] != (self.size_px[1], self.size_px[0]):
                 self._warn(f"{path.name} cannot be decoded; skipped")
                 continue
             yield CameraFrame(image, time_ns, seq, tags.geotag, path.name)
             seq += 1
+
+    def _load(self, path: Path, tags: Tags) -> U8 | None:
+        """(H, W, 3) BGR as it is used; None when the file does not decode, or its size is no longer
+        that of its ``tags``."""
+        try:
+            if read_tags(path).size_px != tags.size_px:
+                return None
+        except OSError:
+            return None
+        image = _deep(path)
+        if image is not None and image.dtype != np.uint8:
+            image = self._eight_bits(image, path)
+        if image is None:
+            return None
+        back = -(self._turned_deg(tags) // 90)
+        return np.ascontiguousarray(np.rot90(image, back), dtype=np.uint8)
+
+    def _eight_bits(self, image: Array, path: Path) -> Array | None:
+        """A deep image in 8 bits: of all levels, or of those that the stills have."""
+        import cv2
+
+        if self._black_white is None:
+            some = [one for one in map(_deep, self._some) if one is not None]
+            alike = [one for one in some if one.dtype == image.dtype]
+            self._black_white = low, high = black_and_white(alike or [image])
+            if not self._is_photo(image):
+                self._warn(f"levels of the images from {low:.5g} to {high:.5g} are black to white")
+        if self._is_photo(image):
+            return _decoded(path, cv2.IMREAD_COLOR)
+        low, high = self._black_white
+        share = (image.astype(np.float32) - low) * (255.0 / (high - low))
+        shown = np.nan_to_num(share).clip(0.0, 255.0).astype(np.uint8)
+        return shown if shown.ndim == 3 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR))
+
+    def _is_photo(self, image: Array) -> bool:
+        low, high = self._black_white or (0.0, 0.0)
+        return image.dtype == np.uint16 and high - low > WIDE
 
     @property
     def images(self) -> int:
@@ -510,25 +557,38 @@ def _from_first(times_ns: list[int]) -> list[int]:
     return [t - first for t in times_ns]
 
 
-def _load(path: Path, stored_px: tuple[int, int], turned_deg: int) -> U8 | None:
-    """(H, W, 3) BGR, turned clockwise by ``turned_deg``.
+def _deep(path: Path) -> Array | None:
+    """The still as :func:`_decoded`, of as many bits as it has; one channel alone in floats."""
+    import cv2
 
-    None when the file does not decode, or its size is no longer ``stored_px`` (W, H). MemoryError
-    without memory for it, which is no fault of the file.
+    image = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image is None and path.suffix.lower() in (".tif", ".tiff"):
+        image = _decoded(path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    return image
+
+
+def _decoded(path: Path, flags: int) -> Array | None:
+    """(H, W, 3) BGR as stored; None when the file does not decode. ``flags``: cv2.IMREAD_*.
+
+    MemoryError without memory for it, which is no fault of the file.
     """
     import cv2
 
     try:
-        if read_tags(path).size_px != stored_px:
-            return None
         data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image: Array | None = cv2.imdecode(data, cv2.IMREAD_IGNORE_ORIENTATION | flags)
+        return image
     except OSError:
         return None
     except cv2.error as error:
         if error.code == cv2.Error.StsNoMem:
             raise MemoryError(f"no memory for {path.name}") from error
         return None
-    if image is None:
-        return None
-    return np.ascontiguousarray(np.rot90(image, -(turned_deg // 90)), dtype=np.uint8)
+
+
+def black_and_white(images: Iterable[Array]) -> tuple[float, float]:
+    """The levels of deep images that 8 bits show as 0 and 255."""
+    ends = np.array([np.nanpercentile(image[::4, ::4], SHOWN) for image in images])
+    low, high = float(np.nanmin(ends[:, 0])), float(np.nanmax(ends[:, 1]))
+    more = WIDER * max(high - low, 1e-3)
+    return low - more, high + more

@@ -736,3 +736,38 @@ def test_named_stills_get_utc() -> None:
     assert source.epoch_unix_ns == 1_533_430_844_800_000_000
     assert len(times) == 18
     assert times[-1] == 14_780_000_000
+
+
+@pytest.mark.parametrize("kind", ["png", "tif"])
+def test_temperatures_become_grays_that_are_alike_in_all_images(tmp_path: Path, kind: str) -> None:
+    """A thermal camera's counts took two of the 256 grays."""
+    v, u = np.mgrid[0:60, 0:80]
+    counts = [(7000 + 4 * v + 3 * u + 40 * k).astype(np.uint16) for k in range(6)]
+    for k, image in enumerate(counts):
+        cv2.imwrite(str(tmp_path / f"{k}.{kind}"), image)
+    source = open_camera(str(tmp_path))
+    shown = [frame.image.astype(float) for frame in source]
+    rate = np.polyfit(np.array(counts).ravel(), np.array(shown)[..., 1].ravel(), 1)
+    assert 0.2 < rate[0] < 0.5
+    for image, count in zip(shown, counts, strict=True):
+        assert np.ptp(image, axis=2).max() == 0.0
+        assert np.abs(image[..., 0] - np.polyval(rate, count)).max() < 1.5
+    assert [w for w in source.warnings if "are black to white" in w]
+
+
+def test_degrees_in_floats_are_seen_and_what_is_unknown_is_black(tmp_path: Path) -> None:
+    degrees = np.linspace(11.0, 29.0, 4800, dtype=np.float32).reshape(60, 80)
+    degrees[:10, :10] = np.nan
+    cv2.imwrite(str(tmp_path / "a.tif"), degrees)
+    (frame,) = open_camera(str(tmp_path))
+    assert frame.image[:10, :10].max() == 0 and np.ptp(frame.image[20:]) > 60
+
+
+@pytest.mark.parametrize("kind", ["png", "tif"])
+def test_a_photo_of_16_bits_is_shown_whole(tmp_path: Path, kind: str) -> None:
+    photo = np.random.default_rng(0).integers(0, 1 << 16, (60, 80, 3)).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / f"a.{kind}"), photo)
+    source = open_camera(str(tmp_path))
+    (frame,) = source
+    assert np.abs(frame.image.astype(int) - (photo >> 8)).max() <= 1
+    assert not [w for w in source.warnings if "black" in w]
