@@ -445,6 +445,8 @@ def _why_silent(link: LinkReport) -> str:
         return f"does not open: {link.last_error}" if link.last_error else "does not open"
     if link.skipped_bytes:
         return "only noise: is SERIALn_BAUD (PX4: SER_TELn_BAUD) the baud rate of mavlink.links?"
+    if link.name.startswith("lines:"):
+        return "silent: does the sender have this address, and its lines a known header?"
     return "silent: is the autopilot on and its port set to MAVLink 2?"
 
 
