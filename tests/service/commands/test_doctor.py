@@ -85,7 +85,7 @@ def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     for what in ("camera", "camera model", "mavlink", "datalink"):
         assert bare[what][0] == NOTE
     assert findings("mavlink.links=modem:1")["mavlink"][0] == BAD
-    lines = findings(f"mavlink.links=lines:127.0.0.1:{free_port()}")
+    lines = findings(f"mavlink.links=lines:127.0.0.1:{free_port()}", listen_s=1.0)
     assert "known header" in lines["mavlink"][1]
 
 
