@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import re
 import sys
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -361,8 +362,9 @@ def creation_unix_ns(container: Any, stream: Any) -> int | None:
 
 def parse_time_unix_ns(text: str) -> int | None:
     """Unix ns of an ISO 8601 time, UTC when it has no zone; None when invalid."""
-    try:
-        moment = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+    text = re.sub(r"([+-]\d\d)(\d\d)$", r"\1:\2", text.strip().replace("Z", "+00:00"))
+    try:  # Python 3.10 reads no zone without a colon, as QuickTime's
+        moment = datetime.fromisoformat(text)
     except ValueError:
         return None
     if moment.tzinfo is None:
