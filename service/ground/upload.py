@@ -72,7 +72,8 @@ def check_parts(library: Library, parts: Sequence[Part], room_bytes: int | None 
         names = ", ".join(name[:100] for name, _ in parts[:5])
         raise InputError(
             f"{names or 'nothing'} cannot be uploaded: give a ZIP of a scan folder, its scan.db, "
-            "an .mcap, or a video with its flight log, unless that is inside"
+            "an .mcap, or a video with its flight log, unless that is inside; of stills "
+            "'skyrelief replay FOLDER' makes a scan"
         )
     for name, size in parts:
         if not 0 < size <= MAX_UPLOAD_BYTES:

@@ -239,6 +239,14 @@ def test_two_dates_lie_side_by_side(page: Browser, scans: Path, tmp_path: Path) 
     page.image(tmp_path / "swipe.png")  # to look at
 
 
+def test_drones_that_flew_together_are_told_apart(page: Browser, scans: Path) -> None:
+    passing = shutil.ignore_patterns("*-wal", "*-shm")
+    shutil.copytree(scans / "drone-1/test-1", scans / "drone-2/test-1", ignore=passing)
+    page.run("location.reload()")
+    other = "document.querySelector('.compare option:nth-child(2)')?.textContent"
+    assert page.wait(other).endswith(", drone-2")
+
+
 FAILED = "[...document.querySelectorAll('.layer img')].filter(i => i.complete && !i.naturalWidth)"
 DRAWN_BROKEN = f"{FAILED}.filter(i => i.getClientRects().length).length"
 

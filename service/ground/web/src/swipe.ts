@@ -21,10 +21,18 @@ export function comparison(map: FlatMap, scan: api.Scan, names: string[], drawin
   const chooser = el("div", { className: "compare", hidden: true }, el("span", { textContent: "Compare with" }), others);
   const slider = el("input", { type: "range", min: "0", max: "100", step: "0.1", value: "50" });
   slider.setAttribute("aria-label", "line between the two dates");
+  const left = el("span", {});
   const right = el("span", {});
-  const line = el("p", {}, el("span", { textContent: labelOf(scan) }), right);
+  const line = el("p", {}, left, right);
   const divider = el("div", { className: "swipe", hidden: true }, line, slider);
   let found: api.Scan[] = [];
+  /** The date of a scan, which sets it apart from another of its place, where two were flown together with the drone. */
+  const labelOf = (s: api.Scan): string => {
+    if (s.title !== s.scan) return nameOf(s);
+    const when = date(s.started_unix_s);
+    const isShared = [scan, ...found].filter((o) => date(o.started_unix_s) === when).length > 1;
+    return isShared ? `${when}, ${s.drone}` : when;
+  };
   let twins: { own: Layer; twin: Layer }[] = [];
   const cut = (): void => {
     const share = Number(slider.value);
@@ -51,6 +59,7 @@ export function comparison(map: FlatMap, scan: api.Scan, names: string[], drawin
     twins = [];
     divider.hidden = !others.value;
     if (others.value) {
+      left.textContent = labelOf(scan);
       right.textContent = labelOf(found[others.selectedIndex - 1]!);
       const at = `/tiles/${others.value}`;
       for (const name of names) {
@@ -74,9 +83,6 @@ export function comparison(map: FlatMap, scan: api.Scan, names: string[], drawin
   }, notify);
   return { chooser, divider, follow };
 }
-
-/** The date of a scan, which sets it apart from another of its place. */
-const labelOf = (s: api.Scan): string => (s.title === s.scan ? date(s.started_unix_s) : nameOf(s));
 
 /** Whether the outlines of two scans have ground in common. */
 function overlap(a: api.Scan, b: api.Scan): boolean {
