@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
@@ -49,6 +49,7 @@ class BenchOptions:
     rounds: int = 30
     warm_up: int = 3
     backend: str = "cpu"
+    say: Callable[[str], None] = field(default=lambda _: None, kw_only=True)  # what is measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +110,7 @@ def run_benchmarks(
             raise InputError(f"bench {name}: there are {', '.join(known)}")
     results: list[BenchResult] = []
     for name in names:
+        options.say(name)
         module, _, function = known[name].partition(":")
         found = getattr(import_module(module), function)(options)
         results += [replace(result, name=result.name or name) for result in found]

@@ -32,10 +32,12 @@ def run(options: BenchOptions, widths: Sequence[int] = WIDTHS) -> list[BenchResu
     flight_s = max(2, round(options.rounds / 3.0))
     results = stereo.run(options)
     with tempfile.TemporaryDirectory() as folder, watched(Path(folder)) as readings:
+        options.say("board: decoding")
         video = Path(folder) / "flight.mp4"
         make_video(video, flight_s * FPS)
         results.append(_decoding(video))
         for width in widths:
+            options.say(f"board: a flight, stereo {width} wide")
             results += _whole_path(video, width, options.backend, flight_s)
     return results + sheet(readings)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from service.commands import AsJson, BackendName
+from service.commands import AsJson, BackendName, showing
+from service.progress import Progress
 
 
 def bench(
@@ -23,10 +25,11 @@ def bench(
     """Print our figure, the peer's in the same run, and the ratio."""
     from service import bench as benchmarks
 
-    options = benchmarks.BenchOptions(rounds=rounds, backend=backend)
     chosen = names or list(benchmarks.BENCHMARKS)
     before = benchmarks.last_kept(keep, chosen) if keep is not None else {}
-    results = benchmarks.run_benchmarks(chosen, options)
+    with nullcontext(Progress()) if as_json else showing("bench") as progress:
+        options = benchmarks.BenchOptions(rounds=rounds, backend=backend, say=progress)
+        results = benchmarks.run_benchmarks(chosen, options)
     print(benchmarks.table(results, before))
     report = benchmarks.record(results, options)
     if keep is not None:

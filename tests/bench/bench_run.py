@@ -14,6 +14,7 @@ import typer
 from bench_options import DataOptions
 
 from service.bench import BENCHMARKS, keep, record, run_benchmarks, table
+from service.commands import showing
 from service.errors import InputError, OutsideError
 
 DEVELOPMENT = {
@@ -55,11 +56,14 @@ def main(
     ] = None,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
-    options = DataOptions(rounds, 3, backend, scans, data, kept, scan, flight, frames)
     known = BENCHMARKS | DEVELOPMENT
     chosen = names or [name for name in known if name not in ASKED_FOR]
     try:
-        results = run_benchmarks(chosen, options, known)
+        with showing("bench") as progress:
+            options = DataOptions(
+                rounds, 3, backend, scans, data, kept, scan, flight, frames, say=progress
+            )
+            results = run_benchmarks(chosen, options, known)
         print(table(results))
         if kept is not None:
             print(f"kept in {keep(kept, chosen, record(results, options))}")

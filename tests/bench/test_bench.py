@@ -79,7 +79,10 @@ def test_the_last_kept_figures_stand_in_the_table(tmp_path: Path) -> None:
 
 
 def test_a_boards_sheet() -> None:
-    results = board.run(BenchOptions(rounds=1, warm_up=0), widths=(320,))
+    said: list[str] = []
+    options = BenchOptions(rounds=1, warm_up=0, say=said.append)
+    results = board.run(options, widths=(320,))
+    assert said == ["board: decoding", "board: a flight, stereo 320 wide"]
     by_name = {result.what: result for result in results}
     path = by_name["whole path, stereo 320 wide"]
     assert path.value > 0 and path.peer_value is not None and not path.note.startswith("0 ")
