@@ -19,7 +19,7 @@ from service.config import Config, ScanConfig
 from service.errors import InputError, refusing
 from service.init_system import Notifier
 from service.listener import free_ports
-from service.scans.writing import writing_folder
+from service.scans.writing import existing, writing_folder
 from service.workers import PROCESS, Worker, python_command, run_process
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,8 @@ class SimulatedFlight:
         scan = config.scan
         if scan.start == "on-command":
             scan = replace(scan, start="on-boot")
-        if scan.folder == ScanConfig().folder and not can_write(Path(scan.folder)):
+        folder = Path(scan.folder)
+        if folder == Path(ScanConfig().folder) and not os.access(existing(folder), os.W_OK):
             scan = replace(scan, folder=str(self._state / "scans"))
         return replace(
             config,
@@ -124,12 +125,3 @@ def render_flight(folder: Path, given: dict[str, str]) -> None:
             notifier.closing()  # extends systemd's timeout
 
     recording.write(simulation, folder, report)
-
-
-def can_write(folder: Path) -> bool:
-    """True when the folder can be made and written to."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)

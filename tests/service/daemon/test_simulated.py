@@ -18,7 +18,6 @@ from loopback import free_port, until
 
 from service.cameras import open_camera
 from service.config import load_config
-from service.daemon import simulated
 from service.daemon.simulated import SimulatedFlight
 from service.errors import InputError, OutsideError
 
@@ -100,7 +99,7 @@ def test_it_flies_and_ends_with_its_camera(tmp_path: Path, service: type[Service
 def test_the_configuration_leads_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
     flight = SimulatedFlight(SOURCE, lambda folder, given: None)
-    monkeypatch.setattr(simulated, "can_write", lambda folder: False)
+    monkeypatch.setattr("os.access", lambda *_: False)
     config = flight.configured(load_config(None, [f"camera.source={SOURCE}"]))
     assert flight.folder == tmp_path / "sim-320x180-5-4-1"
     assert config.camera.source.startswith("stream:udp://127.0.0.1:")
