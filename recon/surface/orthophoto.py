@@ -20,10 +20,10 @@ from recon.image_quality import sharpness
 from recon.mapping.free_space import pixel_of
 from recon.parallel import parallel_for
 from recon.surface.raster import Grid, Raster, highest_lowest
-from recon.surface.texture_atlas import cameras, flat, sample
+from recon.surface.texture_atlas import Images, add_view, images_of, sample
 from recon.surface.texture_views import TextureView, TriangleViews, drop_outliers, insert
 from recon.surface.texturing import levels
-from recon.types import F32, F64, I32, I64, U8, Bool
+from recon.types import F32, F64, I32, U8, Bool
 
 CLEAR_M = 0.3
 """A surface this far above the line to a camera hides a place."""
@@ -67,8 +67,8 @@ def orthophoto(
     Cells that no view shows take the colour of the surface model. ``progress`` is called STEPS
     times.
     """
-    lens, images = cameras(views), flat(views)
-    found = _sightings(terrain, views, (*lens, *images), progress)
+    images = images_of(views, np.zeros((0, 3, 2), np.float32))
+    found = _sightings(terrain, views, images, progress)
     progress("painting the orthophoto")
     label = found.view[:, 0]
     if terrain.objects is not None:
@@ -84,9 +84,8 @@ def orthophoto(
     )
     parallel_for(
         _paint, len(rgb), np.ascontiguousarray(terrain.places_m), _axes(terrain.places_m),
-        terrain.raster.height_m,
-        terrain.raster.rgb, np.ascontiguousarray(label), *lens, levels(found, len(views)),
-        *images, to_cell, rgb, known,
+        terrain.raster.height_m, terrain.raster.rgb, np.ascontiguousarray(label),
+        images._replace(levels=levels(found, len(views))), to_cell, rgb, known,
     )  # fmt: skip
     return rgb, known
 
@@ -94,7 +93,7 @@ def orthophoto(
 def _sightings(
     terrain: Terrain,
     views: Sequence[TextureView],
-    images: tuple[F64, F64, U8, I64, I64],
+    images: Images,
     progress: Callable[[str], None],
 ) -> TriangleViews:
     """The views of each cell, the best first: pixels per metre times the cosine to the vertical,
@@ -112,7 +111,7 @@ def _sightings(
         progress("choosing views for the orthophoto")
         parallel_for(
             _look, end - first, first, places, raster.height_m, around, highest, eyes, centres,
-            sharp, *images, out.view, out.px_per_m, out.bgr,
+            sharp, images, out.view, out.px_per_m, out.bgr,
         )  # fmt: skip
     return out
 
@@ -153,30 +152,29 @@ def _sharpness(views: Sequence[TextureView]) -> F64:
 @njit(cache=True, nogil=True)
 def _look(
     begin: int, end: int, first: int, places: F64, height: F32, around: F32, highest: float,
-    eyes: F64, centres: F64, sharp: F64, K: F64, T: F64, pixels: U8, start: I64, sides: I64,
-    view: I32, px: F32, bgr: F32,
+    eyes: F64, centres: F64, sharp: F64, images: Images, view: I32, px: F32, bgr: F32,
 ) -> None:  # fmt: skip
     """Fill the sightings of rows of cells, counted from the row ``first``."""
     cols = height.shape[1]
     colour = np.empty(3)
     for r in range(first + begin, first + end):
-        for number in range(len(K)):
-            h, w = sides[number, 0], sides[number, 1]
+        for number in range(len(images.K)):
+            h, w = images.sides[number, 0], images.sides[number, 1]
             eye, centre = (eyes[number, 0], eyes[number, 1], eyes[number, 2]), centres[number]
             for c in range(cols):
                 if np.isnan(height[r, c]):
                     continue
                 x, y, z = places[r, c, 0], places[r, c, 1], places[r, c, 2]
-                u, v, depth = pixel_of(K[number], T[number], x, y, z)
+                u, v, depth = pixel_of(images.K[number], images.T[number], x, y, z)
                 if not (EDGE_PX <= u <= w - 1 - EDGE_PX and EDGE_PX <= v <= h - 1 - EDGE_PX):
                     continue
-                if sample(pixels, start[number], h, w, u, v, colour) < 0.99:
+                if sample(images, number, u, v, colour) < 0.99:
                     continue
                 if _is_hidden(height, around, highest, r, c, eye):
                     continue
                 n = r * cols + c
                 east, north, up = x - centre[0], y - centre[1], z - centre[2]
-                score = K[number, 0, 0] / depth * abs(up) * sharp[number]
+                score = images.K[number, 0, 0] / depth * abs(up) * sharp[number]
                 score /= np.sqrt(east**2 + north**2 + up**2)
                 insert(view[n], px[n], bgr[n], number, np.float32(score), colour)
     drop_outliers((first + begin) * cols, (first + end) * cols, view, px, bgr)
@@ -203,10 +201,8 @@ def _is_hidden(
 
 @njit(cache=True, nogil=True)
 def _paint(
-    begin: int, end: int, places: F64, axes: F64, height: F32, fallback: U8, label: I32, K: F64,
-    T: F64,
-    levels: F32, pixels: U8, start: I64, sides: I64, to_cell: tuple[float, float, float], rgb: U8,
-    known: Bool,
+    begin: int, end: int, places: F64, axes: F64, height: F32, fallback: U8, label: I32,
+    images: Images, to_cell: tuple[float, float, float], rgb: U8, known: Bool,
 ) -> None:  # fmt: skip
     """Fill rows of ``rgb`` and ``known``; their cells are the model's by offset and scale."""
     rows, cols = height.shape
@@ -225,9 +221,7 @@ def _paint(
                 continue
             known[i, j] = True
             _place(places, axes, r, c, near, a, b, share, place)
-            total = _mix(
-                place, label, r, c, share, K, T, levels, pixels, start, sides, colour, mixed
-            )
+            total = _mix(place, label, r, c, share, images, colour, mixed)
             for k in range(3):
                 value = float(fallback[r + near // 2, c + near % 2, k])
                 if total > 1e-3:
@@ -313,9 +307,8 @@ def _place(
 
 @njit(cache=True, nogil=True)
 def _mix(
-    place: F64, label: I32, r: int, c: int, share: F64, K: F64, T: F64, levels: F32, pixels: U8,
-    start: I64, sides: I64, colour: F64, mixed: F64,
-) -> float:  # fmt: skip
+    place: F64, label: I32, r: int, c: int, share: F64, images: Images, colour: F64, mixed: F64
+) -> float:
     """Mean colour (times its weight) of a place in the views of four cells; the weight."""
     mixed[:] = 0.0
     total = 0.0
@@ -329,10 +322,5 @@ def _mix(
                 weight += share[m]
         if view < 0 or is_repeated or weight < 1e-3:
             continue
-        u, v, _ = pixel_of(K[view], T[view], place[0], place[1], place[2])
-        alpha = sample(pixels, start[view], sides[view, 0], sides[view, 1], u, v, colour)
-        weight *= alpha
-        total += weight
-        for k in range(3):
-            mixed[k] += weight * (levels[view, k, 0] * colour[k] + levels[view, k, 1])
+        total += add_view(images, view, place[0], place[1], place[2], weight, colour, mixed)
     return total

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from recon.mapping.free_space import pixel_of
+from recon.parallel import parallel_for
 from recon.surface.meshing import Mesh
-from recon.surface.texture_views import TextureView, TriangleViews, doubled_area
+from recon.surface.texture_views import TextureView, TriangleViews, doubled_area, steady_normals
 from recon.types import F32, F64, I32, I64, U8, Bool
 
 BORDER_PX = 2
@@ -28,14 +29,11 @@ MIN_WEIGHT = -2.0
 edge, as its own plane leads anywhere."""
 
 MAX_SCALE, MIN_SCALE = 2.0, 1 / 64
-BAND_ROWS = 512
-"""Rows of the atlas whose borders are made at a time."""
-
 HEIGHT_STEP = 1.25
 """Charts whose heights differ by no more than this factor may share a shelf."""
 
-CELL_PX = 4
-"""Side of the square that holds a triangle which no view sees."""
+UNSEEN_TEXELS = 4.0
+"""Of a triangle that no view sees, in the mean: its colours run evenly from corner to corner."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,38 +51,37 @@ def lay_out(
 ) -> Layout:
     """The atlas of triangles labelled with their view (-1: none), no side above ``largest_px``.
 
-    The mesh needs ``rgb``. A chart is a connected piece of one label, as the view sees it. Charts
-    are packed in shelves by height, those of like brightness next to each other; when they do not
-    fit, all are scaled down, to MIN_SCALE at least: their borders and triangles without a view keep
-    their size, and may need a larger atlas.
+    The mesh needs ``rgb``. A chart is a connected piece of one label, as the view sees it; of
+    triangles without a view, as seen along that axis which they face most. Charts are packed in
+    shelves by height, those of like brightness next to each other; when they do not fit, all are
+    scaled down, to MIN_SCALE at least: their borders keep their size, and may need a larger atlas.
     """
     assert mesh.rgb is not None
+    label, uv = label.copy(), _seen_uv(mesh, views, label)
+    unseen = np.flatnonzero(label < 0)
+    axis, uv[unseen] = _flattened(mesh.vertices_m[mesh.faces], neighbours, unseen)
+    label[unseen] = -1 - axis
     chart = _charts(label, neighbours)
-    uv = _seen_uv(mesh, views, label)
-    brightness = mesh.rgb[mesh.faces].mean(axis=(1, 2))
-    lone = np.flatnonzero(label < 0)
-    lone = lone[np.argsort(brightness[lone], kind="stable")]
+    brightness = np.bincount(chart, mesh.rgb[mesh.faces].mean(axis=(1, 2))) / np.bincount(chart)
     scale = _scale_for(uv[label >= 0])
-    count = np.bincount(chart[chart >= 0])
-    of_chart = np.append(np.bincount(chart[chart >= 0], brightness[chart >= 0]) / count, 0.0)
     while True:
         low, size = _boxes(uv * scale, chart)
-        columns = max(1, int(np.sqrt(len(lone))))
-        block = np.array([[columns, -(-len(lone) // columns)]], np.int64) * CELL_PX
-        place, (w, h) = pack(np.concatenate([size, block]), of_chart)
+        place, (w, h) = pack(size, brightness)
         if max(w, h) <= largest_px or scale < MIN_SCALE:
             break
         scale *= 0.98 * largest_px / max(w, h)
-    out = uv * scale
-    seen = label >= 0
-    shift = place[:-1] + BORDER_PX - low
-    out[seen] += shift[chart[seen], None]
-    n = np.arange(len(lone))
-    cell = place[-1] + CELL_PX * np.column_stack([n % columns, n // columns])
-    out[lone] = cell[:, None] + np.array([[0.5, 0.5], [3.5, 0.5], [0.5, 3.5]])
-    number = chart.copy()
-    number[lone] = len(size) + n
-    return Layout(out, number.astype(np.int32), (int(w), int(h)), scale)
+    out = uv * scale + (place + BORDER_PX - low)[chart, None]
+    return Layout(out, chart, (int(w), int(h)), scale)
+
+
+def _flattened(corners: F64, neighbours: I32, some: I64) -> tuple[I64, F64]:
+    """Of ``some`` triangles (F, 3, 3): the axis (N,) that each faces most, and its corners
+    (N, 3, 2) seen along it, in texels."""
+    area, normal = steady_normals(corners, neighbours)
+    axis = np.abs(normal[some]).argmax(axis=1)
+    others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    texels = np.sqrt(UNSEEN_TEXELS * len(some) / max(float(area[some].sum()), 1e-9))
+    return axis, np.take_along_axis(corners[some], others[:, None], axis=2) * texels
 
 
 def _scale_for(uv: F64) -> float:
@@ -96,20 +93,15 @@ def _scale_for(uv: F64) -> float:
 
 
 def _charts(label: I32, neighbours: I32) -> I32:
-    """(F,) number of the connected piece of one label; -1 for triangles without a view."""
+    """(F,) number of the connected piece of one label."""
     f, e = np.nonzero(neighbours >= 0)
     g = neighbours[f, e]
-    same = (label[f] == label[g]) & (label[f] >= 0)
+    same = label[f] == label[g]
     count = len(label)
     graph = sparse.csr_matrix(
         (np.ones(int(same.sum()), np.int8), (f[same], g[same])), shape=(count, count)
     )
-    piece = csgraph.connected_components(graph, directed=False)[1]
-    out = np.full(count, -1, np.int32)
-    seen = label >= 0
-    if seen.any():
-        out[seen] = np.unique(piece[seen], return_inverse=True)[1]
-    return out
+    return np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int32)
 
 
 def _seen_uv(mesh: Mesh, views: Sequence[TextureView], label: I32) -> F64:
@@ -128,10 +120,9 @@ def _boxes(uv: F64, chart: I32) -> tuple[F64, I64]:
     """Whole upper left corner (C, 2) of each chart and its size (C, 2) with border."""
     count = int(chart.max(initial=-1)) + 1
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    seen = chart >= 0
     for corner in range(3):
-        np.minimum.at(low, chart[seen], uv[seen, corner])
-        np.maximum.at(high, chart[seen], uv[seen, corner])
+        np.minimum.at(low, chart, uv[:, corner])
+        np.maximum.at(high, chart, uv[:, corner])
     low = np.floor(low)
     return low, (np.ceil(high) - low).astype(np.int64) + 2 * BORDER_PX
 
@@ -157,117 +148,126 @@ def pack(size: I64, brightness: F64) -> tuple[F64, tuple[int, int]]:
     return place, (max(width, 1), max(y + shelf, 1))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Palette:
+class Images(NamedTuple):
+    """Views for compiled functions."""
+
+    pixels: U8  # BGRA of all views, one after the other
+    start: I64  # (V,) where each begins
+    sides: I64  # (V, 2) h, w
+    K: F64  # (V, 3, 3)
+    T: F64  # (V, 3, 4) world to camera
+    levels: F32  # (V, 3, 2) gain and offset, BGR
+
+
+def images_of(views: Sequence[TextureView], levels: F32) -> Images:
+    sides = np.array([v.bgra.shape[:2] for v in views], np.int64).reshape(-1, 2)
+    ends = np.cumsum(4 * sides[:, 0] * sides[:, 1])
+    pixels = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
+    for view, end in zip(views, ends, strict=True):
+        pixels[end - view.bgra.size : end] = view.bgra.ravel()
+    K = np.array([v.K for v in views], np.float64).reshape(-1, 3, 3)
+    T = np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]).reshape(-1, 3, 4)
+    return Images(pixels, ends - 4 * sides[:, 0] * sides[:, 1], sides, K, T, levels)
+
+
+class Palette(NamedTuple):
     """Images and weights that the texels are mixed from."""
 
-    views: Sequence[TextureView]
-    levels: F32  # (views, 3, 2) gain and offset, BGR
+    images: Images
     fade_view: I32  # (V, B)
     fade_share: F32  # (V, B)
     rgb: U8  # (V, 3) where no view has colour
+
+
+class Painted(NamedTuple):
+    """A mesh with its views, for compiled functions."""
+
+    vertices: F64  # (V, 3)
+    faces: I32  # (F, 3)
+    uv: F64  # (F, 3, 2) texels
+    label: I32  # (F,) the view of each triangle
+    seen: I32  # (F, CANDIDATES) the views that see it
 
 
 def paint(
     mesh: Mesh, layout: Layout, found: TriangleViews, label: I32, neighbours: I32, palette: Palette
 ) -> U8:
     """(h, w, 3) RGB atlas: each texel the mix of the views that fade there; around each chart its
-    views go on, so that a viewer's mean of four texels shows no line where charts meet."""
+    views go on, so that a viewer's mean of four texels shows no line where charts meet, and beyond
+    its colours, so that smaller images of the atlas show none either."""
     w, h = layout.size_px
     image = np.zeros((h, w, 3), np.uint8)
     done = np.zeros((h, w), np.bool_)
-    views = palette.views
-    pixels, start, sides = flat(views)
     chart = layout.chart
-    is_open = (neighbours < 0) | (chart[neighbours] != chart[:, None])
-    is_border = (label >= 0) & is_open.any(axis=1)
+    is_border = ((neighbours < 0) | (chart[neighbours] != chart[:, None])).any(axis=1)
+    vertices = np.ascontiguousarray(mesh.vertices_m, np.float64)
+    surface = Painted(vertices, mesh.faces, layout.uv_px, label, found.view)
     for faces, margin_px in (
         (np.arange(len(label)), 0.0), (np.flatnonzero(is_border), MARGIN_PX),
     ):  # fmt: skip
-        _paint(
-            faces, margin_px, np.ascontiguousarray(mesh.vertices_m, np.float64), mesh.faces,
-            layout.uv_px, label, found.view, palette.fade_view, palette.fade_share, palette.rgb,
-            pixels, start, sides, *cameras(views), palette.levels, image, done,
-        )  # fmt: skip
-    return bordered(image, done)
+        parallel_for(_paint, h, faces, margin_px, surface, palette, image, done)
+    fill(image, done)
+    return image
 
 
-def cameras(views: Sequence[TextureView]) -> tuple[F64, F64]:
-    """(V, 3, 3) intrinsics and (V, 3, 4) world to camera."""
-    K = np.array([v.K for v in views], np.float64).reshape(-1, 3, 3)
-    T = np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]).reshape(-1, 3, 4)
-    return K, T
+def fill(image: U8, done: Bool) -> None:
+    """Give texels that are not ``done`` the mean of those around that are.
 
-
-def flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
-    """All images in one array, where each begins, and their (h, w)."""
-    sides = np.array([v.bgra.shape[:2] for v in views], np.int64).reshape(-1, 2)
-    start = np.concatenate([[0], np.cumsum(4 * sides[:, 0] * sides[:, 1])]).astype(np.int64)
-    pixels = np.empty(int(start[-1]), np.uint8)
-    for n, view in enumerate(views):
-        pixels[start[n] : start[n + 1]] = view.bgra.ravel()
-    return pixels, start, sides
-
-
-def bordered(image: U8, done: Bool) -> U8:
-    """The charts' colours carried past their edges, until no texel is without one."""
-    out, reach = np.empty_like(image), BORDER_PX + 1
-    for top in range(0, len(image), BAND_ROWS):  # in single precision an atlas takes a gigabyte
-        first, end = max(top - reach, 0), top + BAND_ROWS
-        whole = _carried(image[first : end + reach], done[first : end + reach], reach)
-        out[top:end] = whole[top - first : end - first]
-    return out
-
-
-def _carried(image: U8, done: Bool, steps: int) -> U8:
-    """Near a chart the mean of what is next to it; farther off that of ever larger squares: a
-    black gap would darken the coarse mip levels."""
-    reached = done.copy()
-    out = image.astype(np.float32)
-    for _ in range(steps):
-        weight = reached.astype(np.float32)
-        total = cv2.boxFilter(weight, -1, (3, 3), normalize=False)
-        new = ~reached & (total > 0.5)
-        sums = cv2.boxFilter(out * weight[..., None], -1, (3, 3), normalize=False)
-        out[new] = sums[new] / total[new, None]
-        reached |= new
-    _fill_gaps(out, reached)
-    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
-
-
-def _fill_gaps(colour: F32, known: Bool) -> None:
-    """Give each texel of ``colour`` (h, w, 3) that is not ``known`` the mean of the known ones in
-    the smallest square of a pyramid of halves that holds some."""
-    h, w = known.shape
-    if known.all() or not known.any():
+    By ever smaller images (pull-push, Gortler et al. 1996, doi:10.1145/237170.237200).
+    """
+    if done.all() or done.size == 1:
         return
-    half = (-(-w // 2), -(-h // 2))
-    padded = cv2.copyMakeBorder(
-        np.dstack([colour * known[..., None], known.astype(np.float32)]),
-        0, 2 * half[1] - h, 0, 2 * half[0] - w, cv2.BORDER_CONSTANT, value=0,
-    )  # fmt: skip
-    mean = cv2.resize(padded, half, interpolation=cv2.INTER_AREA)
-    seen = mean[..., 3] > 0
-    coarse = mean[..., :3] / np.maximum(mean[..., 3:], 1e-9)
-    _fill_gaps(coarse, seen)
-    row, column = np.nonzero(~known)
-    colour[row, column] = coarse[row // 2, column // 2]
+    small, known = _halved(image, done)
+    fill(small, known)
+    _take(small, image, done)
+
+
+@njit(cache=True, nogil=True)
+def _halved(image: U8, done: Bool) -> tuple[U8, Bool]:  # pragma: no cover - compiled
+    """The means of two by two texels, of those that are ``done``, and where there is one."""
+    h, w = done.shape
+    small = np.zeros(((h + 1) // 2, (w + 1) // 2, 3), np.uint8)
+    known = np.zeros(small.shape[:2], np.bool_)
+    for row in range(small.shape[0]):
+        for col in range(small.shape[1]):
+            total, count = np.zeros(3), 0
+            for i in range(2 * row, min(2 * row + 2, h)):
+                for j in range(2 * col, min(2 * col + 2, w)):
+                    if done[i, j]:
+                        count += 1
+                        for k in range(3):
+                            total[k] += image[i, j, k]
+            if count:
+                known[row, col] = True
+                for k in range(3):
+                    small[row, col, k] = np.uint8(total[k] / count + 0.5)
+    return small, known
+
+
+@njit(cache=True, nogil=True)
+def _take(small: U8, image: U8, done: Bool) -> None:  # pragma: no cover - compiled
+    for row in range(done.shape[0]):
+        for col in range(done.shape[1]):
+            if not done[row, col]:
+                for k in range(3):
+                    image[row, col, k] = small[row // 2, col // 2, k]
 
 
 @njit(cache=True, nogil=True)
 def sample(
-    pixels: U8, start: int, h: int, w: int, u: float, v: float, out: F64
+    images: Images, number: int, u: float, v: float, out: F64
 ) -> float:  # pragma: no cover - compiled
-    """Bilinear colour into ``out`` (3,), weighted by alpha; the alpha 0 to 1 found there."""
+    """Bilinear colour of a view into ``out`` (3,), weighted by alpha; the alpha 0 to 1 there."""
     out[0] = out[1] = out[2] = 0.0
+    h, w = images.sides[number, 0], images.sides[number, 1]
     if not (0.0 <= u <= w - 1.0 and 0.0 <= v <= h - 1.0):
         return 0.0
     i, j = min(int(v), h - 2), min(int(u), w - 2)
     a, b = v - i, u - j
-    alpha = 0.0
+    alpha, pixels = 0.0, images.pixels
     for di in range(2):
         for dj in range(2):
-            at = start + 4 * ((i + di) * w + j + dj)
+            at = images.start[number] + 4 * ((i + di) * w + j + dj)
             share = (a if di else 1.0 - a) * (b if dj else 1.0 - b) * pixels[at + 3] / 255.0
             alpha += share
             for c in range(3):
@@ -279,52 +279,81 @@ def sample(
 
 
 @njit(cache=True, nogil=True)
-def _mix(
-    x: float, y: float, z: float, ids: I32, shares: F64, seen: I32, pixels: U8, start: I64,
-    sides: I64, K: F64, T: F64, levels: F32, colour: F64, out: F64,
-) -> float:  # fmt: skip  # pragma: no cover - compiled
-    """Add the views' colours of a place, weighted, into ``out`` (3,); the weight added."""
-    total = 0.0
-    for n in range(len(ids)):
-        v = ids[n]
-        if v < 0 or shares[n] < 0.01:
-            continue
-        visible = False
-        for k in range(len(seen)):
-            visible |= seen[k] == v
-        if not visible:
-            continue
-        px, py, _ = pixel_of(K[v], T[v], x, y, z)
-        alpha = sample(pixels, start[v], sides[v, 0], sides[v, 1], px, py, colour)
-        weight = shares[n] * alpha
-        total += weight
-        for c in range(3):
-            out[c] += weight * (levels[v, c, 0] * colour[c] + levels[v, c, 1])
-    return total
+def add_view(
+    images: Images, number: int, x: float, y: float, z: float, weight: float, colour: F64, out: F64
+) -> float:  # pragma: no cover - compiled
+    """Add a view's levelled colour of a place, weighted, to ``out`` (3,); the weight added.
+
+    ``colour`` (3,) is room for it.
+    """
+    u, v, _ = pixel_of(images.K[number], images.T[number], x, y, z)
+    weight *= sample(images, number, u, v, colour)
+    for c in range(3):
+        levels = images.levels[number, c]
+        out[c] += weight * (levels[0] * colour[c] + levels[1])
+    return weight
+
+
+class _Mixed(NamedTuple):
+    """The views that are mixed in one triangle; room for a texel's colours."""
+
+    views: I32  # (3 B + 1,) each once
+    slots: I32  # (3 B + 1,) which of these the corners' views and its own are; -1: it sees none
+    shares: F64  # (3 B + 1,) of the views
+    colour: F64  # (3,)
+    total: F64  # (3,)
+
+
+@njit(cache=True, nogil=True)
+def _gather(
+    f: int, surface: Painted, palette: Palette, mixed: _Mixed
+) -> int:  # pragma: no cover - compiled
+    """Find the views that are mixed in triangle ``f``; how many."""
+    blended, count = palette.fade_view.shape[1], 0
+    for n in range(len(mixed.slots)):
+        view = surface.label[f]
+        if n < 3 * blended:
+            view = palette.fade_view[surface.faces[f, n // blended], n % blended]
+        mixed.slots[n] = -1
+        for one in surface.seen[f]:
+            if one == view and view >= 0:
+                slot = 0
+                while slot < count and mixed.views[slot] != view:
+                    slot += 1
+                mixed.views[slot], mixed.slots[n] = view, slot
+                count = max(count, slot + 1)
+    return count
 
 
 @njit(cache=True, nogil=True)
 def _texel(
-    f: int, a: float, b: float, c: float, vertices: F64, faces: I32, seen: I32, fade_share: F32,
-    rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64, levels: F32, ids: I32,
-    shares: F64, colour: F64, mixed: F64, out: U8,
+    f: int, a: float, b: float, c: float, surface: Painted, palette: Palette, mixed: _Mixed,
+    count: int, out: U8,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """The colour of the place with weights a, b, c of the corners of triangle ``f``."""
-    blended = fade_share.shape[1]
-    p, q, r = faces[f, 0], faces[f, 1], faces[f, 2]
-    for j in range(blended):
-        shares[j] = a * fade_share[p, j]
-        shares[blended + j] = b * fade_share[q, j]
-        shares[2 * blended + j] = c * fade_share[r, j]
-    shares[3 * blended] = 1e-2  # the own view, should no other show anything
-    x = a * vertices[p, 0] + b * vertices[q, 0] + c * vertices[r, 0]
-    y = a * vertices[p, 1] + b * vertices[q, 1] + c * vertices[r, 1]
-    z = a * vertices[p, 2] + b * vertices[q, 2] + c * vertices[r, 2]
-    mixed[0] = mixed[1] = mixed[2] = 0.0
-    total = _mix(x, y, z, ids, shares, seen[f], pixels, start, sides, K, T, levels, colour, mixed)
+    blended, shares = palette.fade_share.shape[1], mixed.shares
+    p, q, r = surface.faces[f, 0], surface.faces[f, 1], surface.faces[f, 2]
+    shares[:count] = 0.0
+    for n in range(len(mixed.slots)):
+        if mixed.slots[n] >= 0:
+            share = 1e-2  # the own view, should no other show anything
+            if n < 3 * blended:
+                share = a if n < blended else b if n < 2 * blended else c
+                share *= palette.fade_share[surface.faces[f, n // blended], n % blended]
+            shares[mixed.slots[n]] += share
+    one, two, three = surface.vertices[p], surface.vertices[q], surface.vertices[r]
+    x = a * one[0] + b * two[0] + c * three[0]
+    y = a * one[1] + b * two[1] + c * three[1]
+    z = a * one[2] + b * two[2] + c * three[2]
+    mixed.total[:] = whole = 0.0
+    for n in range(count):
+        if shares[n] >= 1e-2:
+            view = mixed.views[n]
+            whole += add_view(palette.images, view, x, y, z, shares[n], mixed.colour, mixed.total)
+    rgb = palette.rgb
     for k in range(3):
-        if total > 1e-3:
-            value = mixed[2 - k] / total
+        if whole > 1e-3:
+            value = mixed.total[2 - k] / whole
         else:
             value = a * rgb[p, k] + b * rgb[q, k] + c * rgb[r, k]
         out[k] = np.uint8(min(max(value + 0.5, 0.0), 255.0))
@@ -352,22 +381,26 @@ def _on_longest_edge(
 
 @njit(cache=True, nogil=True)
 def _paint(
-    painted: I64, margin: float, vertices: F64, faces: I32, uv: F64, label: I32, seen: I32,
-    fade_view: I32, fade_share: F32, rgb: U8, pixels: U8, start: I64, sides: I64, K: F64, T: F64,
-    levels: F32, image: U8, done: Bool,
+    begin: int, end: int, painted: I64, margin: float, surface: Painted, palette: Palette,
+    image: U8, done: Bool,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Fill the texels whose centres lie in the ``painted`` triangles; with a ``margin`` those that
-    are not ``done`` so near to one."""
-    height, width = done.shape
-    blended = fade_view.shape[1]
-    ids = np.empty(3 * blended + 1, np.int32)
-    shares = np.empty(3 * blended + 1)
-    mixed, colour, depth, least = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    """Fill the texels of some rows whose centres lie in the ``painted`` triangles; with a
+    ``margin`` those that are not ``done`` so near to one."""
+    width = done.shape[1]
+    vertices, faces, T = surface.vertices, surface.faces, palette.images.T
+    most = 3 * palette.fade_view.shape[1] + 1
+    mixed = _Mixed(
+        np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(3), np.empty(3)
+    )
+    depth, least = np.empty(3), np.empty(3)
     for f in painted:
-        ax, ay, bx, by = uv[f, 0, 0], uv[f, 0, 1], uv[f, 1, 0], uv[f, 1, 1]
-        cx, cy = uv[f, 2, 0], uv[f, 2, 1]
+        uv, own = surface.uv[f], surface.label[f]
+        ax, ay, bx, by, cx, cy = uv[0, 0], uv[0, 1], uv[1, 0], uv[1, 1], uv[2, 0], uv[2, 1]
+        y0 = max(begin, int(np.ceil(min(ay, by, cy) - margin - 0.5)))
+        y1 = min(end - 1, int(np.floor(max(ay, by, cy) + margin - 0.5)))
+        if y0 > y1:
+            continue
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        own = label[f]
         for k in range(3):  # depths in the own view, for a true perspective inside
             p = faces[f, k]
             depth[k] = 1.0
@@ -375,19 +408,15 @@ def _paint(
                 depth[k] = T[own, 2, 3]
                 for d in range(3):
                     depth[k] += T[own, 2, d] * vertices[p, d]
-            for j in range(blended):
-                ids[k * blended + j] = fade_view[p, j]
-        ids[3 * blended] = own
-        least[:] = -1e-9 if own >= 0 else -0.5  # squares of unseen triangles are filled whole
+        least[:] = -1e-9
         if margin > 0.0 and area != 0.0:
             reach = margin / abs(area)
             least[0] = -reach * np.hypot(cx - bx, cy - by)
             least[1] = -reach * np.hypot(ax - cx, ay - cy)
             least[2] = -reach * np.hypot(bx - ax, by - ay)
-        y0 = max(0, int(np.ceil(min(ay, by, cy) - margin - 0.5)))
-        y1 = min(height - 1, int(np.floor(max(ay, by, cy) + margin - 0.5)))
         x0 = max(0, int(np.ceil(min(ax, bx, cx) - margin - 0.5)))
         x1 = min(width - 1, int(np.floor(max(ax, bx, cx) + margin - 0.5)))
+        count = _gather(f, surface, palette, mixed)
         for row in range(y0, y1 + 1):
             for col in range(x0, x1 + 1):
                 if margin > 0.0 and done[row, col]:
@@ -403,12 +432,11 @@ def _paint(
                 if a < least[0] or b < least[1] or c < least[2]:
                     continue
                 if min(a, b, c) < MIN_WEIGHT:
-                    a, b, c = _on_longest_edge(uv[f], col + 0.5, row + 0.5)
+                    a, b, c = _on_longest_edge(uv, col + 0.5, row + 0.5)
                 a, b, c = a / depth[0], b / depth[1], c / depth[2]
                 whole = a + b + c
                 _texel(
-                    f, a / whole, b / whole, c / whole, vertices, faces, seen, fade_share, rgb,
-                    pixels, start, sides, K, T, levels, ids, shares, colour, mixed,
+                    f, a / whole, b / whole, c / whole, surface, palette, mixed, count,
                     image[row, col],
                 )  # fmt: skip
                 done[row, col] = True

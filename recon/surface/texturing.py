@@ -16,7 +16,7 @@ from numba import njit
 from scipy import sparse
 
 from recon.surface.meshing import Mesh, face_neighbours
-from recon.surface.texture_atlas import Layout, Palette, lay_out, paint
+from recon.surface.texture_atlas import Layout, Palette, images_of, lay_out, paint
 from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
 from recon.types import F32, F64, I32, U8
 
@@ -63,11 +63,11 @@ def texture(
     gains = levels(found, len(views))
     fade_view, fade_share = fading(mesh.faces, label, len(mesh.vertices_m), len(views))
     progress("packing the atlas")
-    mesh = replace(mesh, rgb=spread_colours(mesh.faces, mesh.rgb, found, slot, gains))
-    assert mesh.rgb is not None
+    rgb = spread_colours(mesh.faces, mesh.rgb, found, slot, gains)
+    mesh = replace(mesh, rgb=rgb)
     layout = lay_out(mesh, views, label, neighbours, largest_px)
     progress("painting {} x {} texels".format(*layout.size_px))
-    palette = Palette(views, gains, fade_view, fade_share, mesh.rgb)
+    palette = Palette(images_of(views, gains), fade_view, fade_share, rgb)
     image = paint(mesh, layout, found, label, neighbours, palette)
     used = np.unique(label[label >= 0])
     charts = len(np.unique(layout.chart[label >= 0]))
@@ -131,8 +131,10 @@ def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32, gains: 
 PENALTY = 0.6
 """Cost of an edge between triangles of different views; all resolution lost costs 1."""
 
-ITERATIONS = 30
+ITERATIONS = 100
 DAMPING = 0.5
+SETTLED = 1e-3
+"""A triangle whose messages change by less has no more to say until its neighbours do."""
 
 
 def choose(found: TriangleViews, neighbours: I32) -> I32:
@@ -158,12 +160,14 @@ def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iteration
                         back[f, e] = d
     message = np.zeros((faces, 3, slots), np.float32)  # to (f) over its edge e
     belief = np.empty(slots, np.float32)
+    is_due = view[:, 0] >= 0
     for iteration in range(iterations):
         forward = iteration % 2 == 0
         for n in range(faces):
             f = n if forward else faces - 1 - n
-            if view[f, 0] < 0:
+            if not is_due[f]:
                 continue
+            is_due[f] = False
             for e in range(3):
                 g = neighbours[f, e]
                 if g < 0 or view[g, 0] < 0:
@@ -183,8 +187,10 @@ def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iteration
                     for k in range(slots):
                         if view[f, k] == view[g, j]:
                             value = min(value, belief[k] - least)
-                    old = message[g, back[f, e], j]
-                    message[g, back[f, e], j] = DAMPING * old + (1.0 - DAMPING) * value
+                    change = (1.0 - DAMPING) * (value - message[g, back[f, e], j])
+                    message[g, back[f, e], j] += change
+                    if abs(change) > SETTLED:
+                        is_due[f] = is_due[g] = True
     out = np.full(faces, -1, np.int32)
     for f in range(faces):
         best = np.float32(np.inf)

@@ -12,7 +12,7 @@ from sheets import height_mesh
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut, face_neighbours
 from recon.surface.raster import Grid, Raster
-from recon.surface.texture_atlas import BAND_ROWS, BORDER_PX, bordered, lay_out, pack
+from recon.surface.texture_atlas import BORDER_PX, fill, lay_out, pack
 from recon.surface.texture_views import (
     TextureView,
     TriangleViews,
@@ -387,14 +387,19 @@ def test_cutting_divides_triangles_at_the_border() -> None:
     assert len(cut(mesh, (50.0, 50.0, 60.0, 60.0)).faces) == 0
 
 
-def test_colours_are_carried_past_the_edges_of_charts_alike_in_all_rows() -> None:
-    image, done = np.zeros((BAND_ROWS + 50, 40, 3), np.uint8), np.zeros((BAND_ROWS + 50, 40), bool)
-    done[2:-5, 10] = True
-    image[done] = 10, 20, 30
-    near = BORDER_PX + 1
-    out = bordered(image, done)
-    assert (out[: -5 + near, 10 - near : 11 + near] == [10, 20, 30]).all()
-    assert (out == [10, 20, 30]).all(), "gaps between charts take their colours"
+def test_the_atlas_has_the_colours_of_the_charts_around_where_there_is_no_chart() -> None:
+    image, done = np.zeros((301, 40, 3), np.uint8), np.zeros((301, 40), bool)
+    done[2:-5, 5:9] = done[100, 30] = True
+    image[:, 5:9], image[100, 30] = [10, 20, 30], [200, 200, 200]
+    before = image.copy()
+    fill(image, done)
+    assert (image[done] == before[done]).all()
+    assert (image[200:, :20] == [10, 20, 30]).all()
+    assert (image[98:102, 28:32] == 200).all()
+    assert image.min() >= 10
+    empty = np.zeros((3, 3, 3), np.uint8)
+    fill(empty, np.zeros((3, 3), bool))
+    assert not empty.any()
 
 
 def test_from_afar_small_charts_keep_their_brightness() -> None:
@@ -406,9 +411,9 @@ def test_from_afar_small_charts_keep_their_brightness() -> None:
     for (x, y), (dx, dy), level in zip(place.astype(int), size, brightness, strict=True):
         image[y : y + dy - 1, x : x + dx - 1] = level
         done[y : y + dy - 1, x : x + dx - 1] = True
-    out = bordered(image, done)
+    fill(image, done)
     h, w = h // 16 * 16, w // 16 * 16
-    coarse = out[:h, :w, 0].reshape(h // 16, 16, w // 16, 16).mean(axis=(1, 3))  # mip level 4
+    coarse = image[:h, :w, 0].reshape(h // 16, 16, w // 16, 16).mean(axis=(1, 3))  # mip level 4
     middle = ((place + size / 2)[:, ::-1] / 16).astype(int)
     inside = (middle < coarse.shape).all(axis=1)
     off = np.abs(coarse[tuple(middle[inside].T)] - brightness[inside])
