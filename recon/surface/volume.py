@@ -9,7 +9,7 @@ image sees stand below the edge of the roof.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -66,7 +66,10 @@ class Volume:
     weight: F32  # the same: of the images; 0 where only the upper surface counts
 
 
-def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 400_000) -> Mesh:
+def volume_mesh(
+    depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 400_000,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Mesh:  # fmt: skip
     """The surface inside the outline of ``upper``, closed but at the outline itself.
 
     Args:
@@ -80,8 +83,11 @@ def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 
     inside = outline(upper.known, sure.known, upper.grid.cell_m)
     low_m = terrain(sure, inside).everywhere_m
     upper = without_cells(completed(upper, low_m, inside, upper.known & ~sure.known), ~inside)
+    progress("signed distances")
     volume = _voted(upper, low_m, list(depths))
+    progress("triangles of the surface")
     vertices, faces = _extracted(volume)
+    progress(f"fewer than {len(faces)} triangles")
     vertices, faces = reduced(
         vertices, faces, min(largest_faces, max(MIN_FACES, round(KEPT_FACES * len(faces))))
     )

@@ -212,12 +212,12 @@ def closed_surface(scan: ScanView, largest_faces: int) -> Mesh:
     def made() -> Mesh:
         fused, keyframes = scan.fused, main_keyframes(scan.store)
         with scan.progress.part("surface", 0.3):
-            scan.progress("signed distances")
             xy_m = fused.cloud.xyz_m[:, :2].astype(np.float64)
             grid = grid_over(xy_m, fused.voxel_m, margin_cells=1)
             larger = float(np.clip(np.sqrt(np.prod(grid.shape) / FINE_CELLS), 1.0, VOXEL_SAMPLES))
             raster = rasterise(fused.cloud, grid_over(xy_m, larger * fused.voxel_m, margin_cells=1))
-            return volume_mesh((k.depth for k in keyframes), raster, largest_faces)
+            depths = (k.depth for k in keyframes)
+            return volume_mesh(depths, raster, largest_faces, scan.progress)
 
     return scan.shared(("closed surface", largest_faces), made)
 
