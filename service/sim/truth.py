@@ -15,7 +15,7 @@ import numpy as np
 from recon import se3
 from recon.surface import metrics, triangle_grid
 from recon.surface.triangle_grid import TriangleGrid
-from recon.types import F64, I32
+from recon.types import F64, I32, Bool
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.small_file import read_json
@@ -82,17 +82,22 @@ def heights_below(surface: TriangleGrid, xy_m: F64) -> F64:
 def seen_surface(truth: Truth) -> SeenSurface:
     """Surface that at least VIEWS_TO_COUNT of the frames see; InputError when that is none."""
     samples, normals = metrics.sample_surface(truth.surface, SAMPLE_SPACING_M)
-    frames = np.unique(np.linspace(0, len(truth.poses) - 1, FRAMES_FOR_VISIBILITY).astype(int))
-    views = np.zeros(len(samples), np.int64)
-    for k in frames:
-        views += metrics.seen_from(
-            samples, normals, truth.surface, truth.poses[k], truth.K, np.array(truth.size_px)
-        )
-    seen = views >= min(VIEWS_TO_COUNT, len(frames))
+    seen = seen_by_enough(truth, samples, normals)
     if not seen.any():
         raise InputError("the truth's cameras see none of the truth's surface; wrong folder?")
     area = float(truth.surface.areas().sum()) * float(seen.mean())
     return SeenSurface(samples[seen], normals[seen], area)
+
+
+def seen_by_enough(truth: Truth, places: F64, normals: F64) -> Bool:
+    """(N,) places of the true surface that VIEWS_TO_COUNT of the frames see."""
+    frames = np.unique(np.linspace(0, len(truth.poses) - 1, FRAMES_FOR_VISIBILITY).astype(int))
+    views = np.zeros(len(places), np.int64)
+    for k in frames:
+        views += metrics.seen_from(
+            places, normals, truth.surface, truth.poses[k], truth.K, np.array(truth.size_px)
+        )
+    return np.asarray(views >= min(VIEWS_TO_COUNT, len(frames)))
 
 
 def read_tum(path: Path) -> tuple[F64, F64]:
