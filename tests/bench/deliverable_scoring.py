@@ -34,7 +34,7 @@ from service.offline.exports.surface import FILLED, UNCERTAIN
 from service.sim.recording import Simulation, SimulationOptions, prepare
 from service.sim.render import Look, Renderer
 from service.sim.scoring import alignments, read_scan
-from service.sim.shapes import FLAT, GABLED, KIND, TOP, WALL
+from service.sim.shapes import FLAT, GABLED, GROUND, KIND, TOP, WALL
 from service.sim.truth import (
     Truth,
     heights_below,
@@ -93,8 +93,8 @@ def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     Band 3, where there is one, marks filled cells: they have figures of their own. ``inside`` is
     the share of known cells within the outline of the known ones, ``half_cell_rms_m`` what the true
     heights of places half a cell to the east would have: no step is placed better. ``objects`` are
-    the shares of filled and of uncertain cells where something stands above the ground, and of
-    those whose top too few frames see; ``buildings`` the same of houses and halls.
+    the shares of filled and of uncertain cells where something stands on the ground, and of those
+    whose top too few frames see; ``buildings`` the same of houses and halls.
     """
     from scipy.ndimage import binary_fill_holes
 
@@ -121,38 +121,38 @@ def _dsm(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         if is_filled.any():
             out[name]["filled"] = _height_figures(error[on_truth & is_filled])
             places = np.column_stack([moved[:, :2], true])
-            stands = true - _ground_m(truth.surface, moved[:, :2]) > STEP_M
-            for kind, where in (("objects", stands), ("buildings", _on_buildings(truth, places))):
-                out[name][kind] = _unmeasured(truth, places, image.bands[2][known], where & stands)
+            for kind, where in _what_stands(truth, places).items():
+                out[name][kind] = _unmeasured(truth, places[where], image.bands[2][known][where])
     return out
 
 
-def _unmeasured(truth: Truth, places: F64, kinds: F32, where: Bool) -> list[float]:
+def _unmeasured(truth: Truth, places: F64, kinds: F32) -> list[float]:
     """Shares of filled, of uncertain and of hidden cells."""
-    up = np.tile([0.0, 0.0, 1.0], (int(where.sum()), 1))
-    hidden = ~seen_by_enough(truth, places[where], up)
-    found = [kinds[where] == FILLED, kinds[where] == UNCERTAIN, hidden]
-    return [float(share.mean()) if len(share) else 0.0 for share in found]
+    hidden = ~seen_by_enough(truth, places, np.tile([0.0, 0.0, 1.0], (len(places), 1)))
+    shares = kinds == FILLED, kinds == UNCERTAIN, hidden
+    return [float(share.mean()) if len(share) else 0.0 for share in shares]
 
 
-def _on_buildings(truth: Truth, places: F64) -> Bool:
-    """(N,) places whose highest surface is a house's or a hall's; none where that is not known."""
+def _what_stands(truth: Truth, places: F64) -> dict[str, Bool]:
+    """(N,) which places (N, 3) of the surface are on anything higher than STEP_M above the ground,
+    and which on a house or a hall; empty where the truth's place cannot be laid out again.
+
+    There is no ground below a building.
+    """
     try:
         scene = _simulated(truth.folder).scene
     except InputError:
-        return np.zeros(len(places), np.bool_)
+        return {}
     down = np.tile([0.0, 0.0, -1.0], (len(places), 1))
     _, hit = truth.surface.cast(places + np.array([0.0, 0.0, 0.1]), down)
-    is_block = (hit >= 0) & np.isin(scene.material[hit], (TOP, WALL))
-    kinds = scene.blocks[np.where(is_block, scene.owner[hit], 0), KIND]
-    return np.asarray(is_block & np.isin(kinds, (FLAT, GABLED)))
-
-
-def _ground_m(surface: TriangleGrid, xy_m: F64) -> F64:
-    """(N,) height of the lowest surface at (N, 2) places; NaN outside."""
-    below = np.column_stack([xy_m, np.full(len(xy_m), surface.bounds[2] - 10.0)])
-    t, _ = surface.cast(below, np.tile([0.0, 0.0, 1.0], (len(below), 1)))
-    return np.asarray(below[:, 2] + t)
+    x, y, top = places.T
+    stands = (hit >= 0) & (scene.material[hit] != GROUND)
+    stands &= top - scene.terrain.height(x, y) > STEP_M
+    is_block = stands & np.isin(scene.material[hit], (TOP, WALL))
+    block = scene.blocks[scene.owner[hit[is_block]], KIND]
+    on_buildings = is_block.copy()
+    on_buildings[is_block] = np.isin(block, (FLAT, GABLED))
+    return {"objects": stands, "buildings": on_buildings}
 
 
 def _height_figures(error: F64) -> dict[str, float]:
