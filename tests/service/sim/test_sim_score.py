@@ -21,8 +21,8 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.model import glb
 from service.scans.fused_cloud import write_laz
-from service.sim import scoring
-from service.sim.recording import Faults, SimulationOptions
+from service.sim import scoring, shapes
+from service.sim.recording import Faults, SimulationOptions, prepare
 from service.sim.truth import heights_below, read_surface, read_truth
 
 pytestmark = pytest.mark.slow
@@ -252,7 +252,8 @@ def test_missing_or_damaged_parts_are_named(
 
 
 def delivered(scan: Path, flight: Path, shift_east_m: float, shift_up_m: float) -> None:
-    """Write a DSM, an orthophoto and a mesh made of the truth itself, shifted."""
+    """Write a DSM, an orthophoto and a mesh made of the truth itself, shifted; the DSM is filled
+    but for a metre at the edges of buildings."""
     rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     pytest.importorskip("trimesh")
     truth = read_truth(flight)
@@ -268,10 +269,15 @@ def delivered(scan: Path, flight: Path, shift_east_m: float, shift_up_m: float) 
         "crs": "EPSG:32632", "height": shape[0], "width": shape[1],
         "transform": rasterio.transform.from_origin(west + shift_east_m, north, cell, cell),
     }  # fmt: skip
+    options = json.loads((truth.folder / "params.json").read_text())["options"]
+    blocks = prepare(options_of(options)).scene.blocks
+    houses = blocks[np.isin(blocks[:, shapes.KIND], (shapes.FLAT, shapes.GABLED))]
+    filled = np.any([shapes.inside(house, *xy.T, 1.0) for house in houses], axis=0)
+    bands = np.stack([height, 0 * height, filled]).reshape(3, *shape)
     with rasterio.open(
-        scan / "dsm.tif", "w", driver="GTiff", count=1, dtype="float32", nodata=-9999.0, **place
+        scan / "dsm.tif", "w", driver="GTiff", count=3, dtype="float32", nodata=-9999.0, **place
     ) as image:
-        image.write(height.reshape(shape).astype(np.float32), 1)
+        image.write(bands.astype(np.float32))
     low, high = xy.min(axis=0) - 1.0, xy.max(axis=0) + 1.0
     size = np.ceil((high - low) / 0.125).astype(int)
     above = view_from_above(truth.folder, low[0], high[1], 0.125, (int(size[1]), int(size[0])))
@@ -302,6 +308,8 @@ def test_files_are_measured_where_they_say_they_are(flight: Path, tmp_path: Path
     dsm, ortho, mesh = (found[k]["raw"] for k in ("dsm", "ortho", "mesh"))
     assert dsm["bias_m"] == pytest.approx(0.3, abs=0.02)
     assert dsm["completeness"] > 0.3
+    assert 0.3 < dsm["buildings"][0] < 0.9 and dsm["buildings"][1] == 0.0
+    assert 0.0 < dsm["objects"][0] < dsm["buildings"][0]
     assert ortho["median_m"] == pytest.approx(0.8, abs=0.05)
     assert ortho["east_m"] == pytest.approx(0.8, abs=0.05)
     assert abs(ortho["north_m"]) < 0.05 and found["ortho"]["matched_share"] > 0.9
