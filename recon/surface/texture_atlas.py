@@ -78,7 +78,7 @@ def _flattened(corners: F64, neighbours: I32, some: I64) -> tuple[I64, F64]:
     """Of ``some`` triangles (F, 3, 3): the axis (N,) that each faces most, and its corners
     (N, 3, 2) seen along it, in texels."""
     area, normal = steady_normals(corners, neighbours)
-    axis = np.abs(normal[some]).argmax(axis=1)
+    axis = np.asarray(np.abs(normal[some]).argmax(axis=1), np.int64)
     others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
     texels = np.sqrt(UNSEEN_TEXELS * len(some) / max(float(area[some].sum()), 1e-9))
     return axis, np.take_along_axis(corners[some], others[:, None], axis=2) * texels
