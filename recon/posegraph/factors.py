@@ -19,14 +19,12 @@ from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_a
 from recon.posegraph.records import SIGMA_STEP, Loop, Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
+from recon.posegraph.sensor_offsets import FRAME_SIGMA_RAD, GATE_SIGMAS
 from recon.posegraph.smoother import NO_SCALE, Smoother
 from recon.types import F64, PosePrior
 
 HEIGHT_GATE = 0.05
 """Share of a height by which one exactly below may be off, once its constant is out."""
-
-FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
-"""Smallest sigma of a placed segment's tilt and heading."""
 
 BLOCK = 20
 """Keyframes that share one scale and one altitude bias."""
@@ -50,9 +48,8 @@ SIGMA_SCALE_WALK = 0.003
 BLOCKS_PER_HEIGHT = 2.0
 """Heights above ground of so many blocks count as one: relief is the same under neighbours."""
 
-GATE_SIGMAS, HUBER_SIGMAS = 5.0, 1.5
-"""Beyond so many sigmas from the prediction a reading is left out, as noise alone reaches that once
-in a million; and from so many of its residual on it loses weight."""
+HUBER_SIGMAS = 1.5
+"""From so many of its residual on a reading loses weight."""
 
 FRAME_DRIFT = 0.003
 """Share of the path flown by which a track may leave the frame of its segment."""

@@ -228,8 +228,14 @@ def _wandered(above: F64, fixes: F64, white: float) -> float:
 PRIOR_SIGMA = 0.1
 """rad and share; how far fixes may be turned and stretched against the frame."""
 
-MAX_OFFSET_RAD = 0.2
-"""Attitudes that are further off are at fault, for the gates to find: no offset to take out."""
+GATE_SIGMAS = 5.0
+"""Beyond so many sigmas from the prediction a reading is left out, as noise alone reaches that once
+in a million."""
+
+FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
+"""Smallest sigma of a placed segment's tilt and heading. Attitudes that are further off than this
+and their own allow are at fault, for the gates to find; a constant within is taken out, as it would
+pull the map."""
 
 NEAR_SIGMAS = 5.0
 """Fixes further from the track, or attitudes from their median, are no part of a constant."""
@@ -280,7 +286,8 @@ def _turn(nodes: Sequence[Node], frame: Alignment) -> F64:
     turns = off_attitudes(seen, measured, sigma[:, 2] < 1.0)
     near = np.all(np.abs(turns - np.median(turns, axis=0)) < NEAR_SIGMAS * sigma, axis=1)
     turn = turns[near].mean(axis=0) if near.any() else np.zeros(3)
-    return turn if np.linalg.norm(turn) < MAX_OFFSET_RAD else np.zeros(3)
+    allowed = GATE_SIGMAS * np.hypot(FRAME_SIGMA_RAD, np.median(sigma, axis=0))
+    return turn if np.all(np.abs(turn) < allowed) else np.zeros(3)
 
 
 def _fixes(nodes: Sequence[Node], frame: Alignment) -> tuple[F64, F64, F64, float]:

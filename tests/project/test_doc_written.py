@@ -14,7 +14,7 @@ from doc_pages import FENCE, PAGES, text_of
 from paths import ROOT
 from trial_rig import Table
 
-from recon.posegraph import factors, pose_graph, records
+from recon.posegraph import factors, pose_graph, records, sensor_offsets
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
 from recon.posegraph.pose_graph import PoseGraph
@@ -104,7 +104,7 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
         f"{factors.LINK_RAD} rad ({factors.LINK_WITHOUT_HEADING_RAD} without a heading); "
         f"{factors.LINK_M:.0f} m and {factors.LINK_M_S:.0f} m",
         f"Huber's loss begins at {factors.HUBER_SIGMAS} sigmas",
-        f"more than {factors.GATE_SIGMAS:.0f} sigmas from the prediction",
+        f"more than {sensor_offsets.GATE_SIGMAS:.0f} sigmas from the prediction",
         f"{factors.ALTITUDE_SLACK_M:.0f} m further off",
         f"{pose_graph.SLACK_M:.0f} m and {pose_graph.DRIFT * 100:.0f} % of the path",
         f"{pose_graph.MAX_TURN_RAD} rad; and",

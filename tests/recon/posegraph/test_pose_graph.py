@@ -267,6 +267,20 @@ def test_a_compass_wrong_from_the_start_yields_to_the_track() -> None:
     assert rms_m(graph, f) < 0.8
 
 
+@pytest.mark.parametrize("off_deg", [14.0, 42.0])
+def test_a_compass_off_by_less_than_the_gates_find_does_not_pull_the_graph(off_deg: float) -> None:
+    f = flight(40)
+    off = se3.so3_exp(np.array([0.0, 0.0, np.radians(off_deg)]))
+    for i, p in enumerate(f.priors):
+        assert p.R_world_camera is not None
+        f.priors[i] = replace(p, R_world_camera=off @ p.R_world_camera)
+    graph, pose = fly(f)
+    assert not graph.counts["heading off"]
+    turn = se3.so3_log(pose.T_world_camera[:3, :3] @ f.truth[-1][:3, :3].T)
+    assert np.linalg.norm(turn) < 0.025  # what the fit of the frame leaves
+    assert rms_m(graph, f) < 1.5
+
+
 @pytest.mark.slow
 def test_the_attitude_of_a_wrong_frame_is_left_out() -> None:
     f = flight(90)
