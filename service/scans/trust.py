@@ -195,10 +195,18 @@ def scales_differ(gnss_over_heights: float) -> str:
 
 
 def scale_sigma(run: Mapping[str, Any], georeference: str) -> float | None:
-    """Relative sigma of the scale as the flight measured it, and of the focal length, which scales
-    heights; None where nothing measured it, or where control points gave a better one."""
-    sigma = None if georeference == BY_SURVEY else _number(run.get("scale"), "sigma")
-    return None if sigma is None else math.hypot(sigma, _number(run, "sigma_focal") or 0.0)
+    """Relative sigma of the scale as the flight measured it, of the focal length, which scales
+    heights, and of positions and heights that contradict each other: as unsure as they are apart.
+
+    None where nothing measured it, or where control points gave a better one.
+    """
+    scale = run.get("scale")
+    sigma = None if georeference == BY_SURVEY else _number(scale, "sigma")
+    if sigma is None:
+        return None
+    ratio = _number(scale, "gnss_over_heights") or 0.0
+    apart = math.log(ratio) if ratio > 0.0 else 0.0
+    return math.hypot(sigma, _number(run, "sigma_focal") or 0.0, apart)
 
 
 def depth_share(run: Mapping[str, Any], georeference: str) -> float | None:

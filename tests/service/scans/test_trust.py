@@ -154,6 +154,8 @@ def test_a_run_that_notes_nothing_limits_nothing(run: dict[str, Any]) -> None:
     [
         ({}, "gnss", 0.03),
         ({"sigma_focal": 0.04}, "gnss", 0.05),
+        ({"scale": {"sigma": 0.03, "gnss_over_heights": np.exp(-0.04)}}, "gnss", 0.05),
+        ({"scale": {"sigma": 0.03, "gnss_over_heights": -2.0}}, "gnss", 0.03),
         ({"assumed": ["lens"]}, "gnss", np.hypot(0.03, 0.02)),
         ({"assumed": ["distortion", "altitude"]}, "exif", np.hypot(0.03, 0.01)),
         ({"sigma_focal": 0.04, "assumed": ["distortion"]}, BY_SURVEY, 0.01),
