@@ -184,7 +184,10 @@ def _config(
     )
     config.las_header.min = vector(list(map(float, header.mins)))
     config.las_header.max = vector(list(map(float, header.maxs)))
-    config.las_header.generating_software = "skyrelief"
+    for name in ("generating_software", "system_identifier"):
+        setattr(config.las_header, name, getattr(header, name))
+    flown = header.creation_date.timetuple()
+    config.las_header.creation_year, config.las_header.creation_day = flown.tm_year, flown.tm_yday
     config.las_header.SetGpsTimeBit()  # standard time
     info = config.copc_info
     info.center_x, info.center_y, info.center_z = map(float, 0.5 * (header.mins + header.maxs))

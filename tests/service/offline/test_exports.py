@@ -173,6 +173,8 @@ def test_copc_by_laspy(scan_dir: Path, house: HouseFlight) -> None:
     whole = laspy.read(path)
     assert whole.header.point_count == len(everything)
     assert whole.header.parse_crs().to_epsg() == 32632
+    assert whole.header.creation_date.isoformat() == "2023-11-14"  # of the flight, as in LAZ
+    assert whole.header.system_identifier == "camera stereo"
 
 
 def test_octree_holds_every_point_once_inside_its_node() -> None:
