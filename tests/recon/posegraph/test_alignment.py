@@ -229,8 +229,8 @@ def test_fixes_that_jump_for_two_fifths_of_the_flight_do_not_shift_it(
     for i in jumped:
         p = bad[i].prior
         assert p.position_m is not None
-        jumped = p.position_m + np.array([30.0, -20.0, 8.0])
-        bad[i] = replace(bad[i], prior=replace(p, position_m=jumped))
+        moved = p.position_m + np.array([30.0, -20.0, 8.0])
+        bad[i] = replace(bad[i], prior=replace(p, position_m=moved))
     a, b = fit(good), fit(bad)
     assert a is not None and b is not None
     for i in (0, 15, 29):
