@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 from scipy import sparse
@@ -15,7 +16,7 @@ from recon.mapping.free_space import pixel_of
 from recon.parallel import parallel_for
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView, TriangleViews, doubled_area, steady_normals
-from recon.types import F32, F64, I32, I64, U8, Bool
+from recon.types import F32, F64, I32, I64, U8, Array, Bool
 
 BORDER_PX = 2
 """Texels around a chart that repeat its colours, for filtering and the first mip levels."""
@@ -159,12 +160,17 @@ class Images(NamedTuple):
     levels: F32  # (V, 3, 2) gain and offset, BGR
 
 
-def images_of(views: Sequence[TextureView], levels: F32) -> Images:
+def images_of(views: Sequence[TextureView], levels: F32, fields: Sequence[F32] = ()) -> Images:
+    """The views, times their ``fields`` (rows, cols, 4) where there are some."""
     sides = np.array([v.bgra.shape[:2] for v in views], np.int64).reshape(-1, 2)
     ends = np.cumsum(4 * sides[:, 0] * sides[:, 1])
     pixels = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
-    for view, end in zip(views, ends, strict=True):
-        pixels[end - view.bgra.size : end] = view.bgra.ravel()
+    for n, (view, end) in enumerate(zip(views, ends, strict=True)):
+        bgra: Array = view.bgra
+        if fields:
+            factor = cv2.resize(fields[n], bgra.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+            bgra = cv2.multiply(bgra, factor, dtype=cv2.CV_8U)
+        pixels[end - bgra.size : end] = bgra.ravel()
     K = np.array([v.K for v in views], np.float64).reshape(-1, 3, 3)
     T = np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]).reshape(-1, 3, 4)
     return Images(pixels, ends - 4 * sides[:, 0] * sides[:, 1], sides, K, T, levels)

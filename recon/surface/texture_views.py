@@ -80,7 +80,7 @@ def look(
     out = TriangleViews.none(len(mesh.faces))
     for number, view in enumerate(views):
         progress(number / len(views))
-        px = _projected(view, vertices)
+        px = projected(view, vertices)
         inside = _inside(px, view)
         inside[inside] = _free(reach, view, vertices[inside], tolerance)
         faces = np.flatnonzero(inside[mesh.faces].all(axis=1))
@@ -89,7 +89,7 @@ def look(
         is_seen = facing > MIN_COSINE * np.linalg.norm(towards, axis=1)
         is_seen[is_seen] = _free(reach, view, middle[faces[is_seen]], tolerance)
         faces, facing = faces[is_seen], facing[is_seen]
-        middle_px = _projected(view, middle[faces])
+        middle_px = projected(view, middle[faces])
         ahead = -towards[is_seen] @ view.T_world_camera[:3, 2]
         resolution = np.sqrt(view.K[0, 0] * view.K[1, 1] * facing / ahead**3)
         places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
@@ -202,7 +202,7 @@ def _median(values: F32 | F64, ordered: F64) -> float:
     return float(0.5 * (ordered[(count - 1) // 2] + ordered[count // 2]))
 
 
-def _projected(view: TextureView, xyz: F64) -> F64:
+def projected(view: TextureView, xyz: F64) -> F64:
     """(N, 2) pixels, whole numbers at pixel centres; NaN behind the camera."""
     R, t = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
     return project(view.K, (xyz - t) @ R)

@@ -14,10 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from scipy import sparse
+from scipy.ndimage import gaussian_filter
 
 from recon.surface.meshing import Mesh, face_neighbours
 from recon.surface.texture_atlas import Layout, Palette, images_of, lay_out, paint
-from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
+from recon.surface.texture_views import (
+    TextureView,
+    TriangleViews,
+    consistent,
+    look,
+    projected,
+)
 from recon.types import F32, F64, I32, U8
 
 LARGEST_ATLAS_PX = 8192
@@ -61,13 +68,14 @@ def texture(
     label = np.where(slot >= 0, found.view[np.arange(len(slot)), slot], -1).astype(np.int32)
     progress("levelling exposures")
     gains = levels(found, len(views))
+    fields, found = faded_steps(mesh, views, levelled(found, gains))
     fade_view, fade_share = fading(mesh.faces, label, len(mesh.vertices_m), len(views))
     progress("packing the atlas")
-    rgb = spread_colours(mesh.faces, mesh.rgb, found, slot, gains)
+    rgb = spread_colours(mesh.faces, mesh.rgb, found, slot)
     mesh = replace(mesh, rgb=rgb)
     layout = lay_out(mesh, views, label, neighbours, largest_px)
     progress("painting {} x {} texels".format(*layout.size_px))
-    palette = Palette(images_of(views, gains), fade_view, fade_share, rgb)
+    palette = Palette(images_of(views, gains, fields), fade_view, fade_share, rgb)
     image = paint(mesh, layout, found, label, neighbours, palette)
     used = np.unique(label[label >= 0])
     charts = len(np.unique(layout.chart[label >= 0]))
@@ -98,15 +106,14 @@ SPREAD_RINGS = 12
 """So many rings of vertices around what views show take its colours."""
 
 
-def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32, gains: F32) -> U8:
+def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32) -> U8:
     """(V, 3) colours for triangles without a view: those of the seen ones around them, beyond
     SPREAD_RINGS the vertices' own ``rgb``.
 
     A vertex's own colour is that of the upper surface above or below it: a roof's, on a wall.
     """
     rows = np.flatnonzero(slot >= 0)
-    view = found.view[rows, slot[rows]]
-    shown = found.bgr[rows, slot[rows]] * gains[view, :, 0] + gains[view, :, 1]
+    shown = found.bgr[rows, slot[rows]]
     corner = np.repeat(np.arange(len(rows)), 3), faces[rows].ravel()
     ones = np.ones(3 * len(rows), np.float32)
     total = sparse.csr_matrix((ones, corner), (len(rows), len(rgb))).T @ np.column_stack(
@@ -241,6 +248,9 @@ UNCHANGED_LEVELS = 0.5
 """Most images have the flight's exposure. Those that differ by more count less for it: few odd
 ones, as under a cloud, do not make all others brighter or darker."""
 
+FIELD_CELLS, FIELD_SIGMA = 24, 1.7
+"""Along the longer side of an image, of the field of its brightness, and how smooth that is."""
+
 FADE_RINGS = 4
 """Rings of triangles on each side of a seam across which the views fade."""
 
@@ -340,6 +350,47 @@ def _add_pairs(
         for i in range(4):
             for j in range(4):
                 N[at[i], at[j]] += weight * row[i] * row[j]
+
+
+def levelled(found: TriangleViews, gains: F32) -> TriangleViews:
+    """The same views with their colours after :func:`levels`."""
+    none = np.array([[[1.0, 0.0]] * 3], np.float32)
+    gain, offset = np.moveaxis(np.concatenate([gains, none])[found.view], -1, 0)
+    return replace(found, bgr=found.bgr * gain + offset)
+
+
+def faded_steps(
+    mesh: Mesh, views: Sequence[TextureView], found: TriangleViews
+) -> tuple[list[F32], TriangleViews]:
+    """For each view (rows, cols, 4) factors over its image that take it to the mean of what all
+    levelled views show of a place, and ``found`` with these colours.
+
+    One gain for an image leaves steps where haze, a cloud's edge or the lens make it brighter in
+    one part only. A factor is of surroundings as wide as FIELD_SIGMA, so details stay.
+    """
+    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
+    middle, area = (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    mean = found.bgr.sum(axis=1) / np.maximum((found.view >= 0).sum(axis=1), 1)[:, None]
+    bgr, fields = found.bgr.copy(), []
+    for number, view in enumerate(views):
+        f, slot = np.nonzero(found.view == number)
+        h, w = view.bgra.shape[:2]
+        rows, cols = (max(2, round(FIELD_CELLS * side / max(h, w))) for side in (h, w))
+        place = (projected(view, middle[f]) + 0.5) * [cols / w, rows / h]
+        col, row = np.clip(place.astype(np.int64), 0, [cols - 1, rows - 1]).T
+        weight = area[f] * found.px_per_m[f, slot] ** 2
+        sums = [
+            np.bincount(row * cols + col, weight * colour, rows * cols).reshape(rows, cols)
+            for colour in (*mean[f].T, *found.bgr[f, slot].T)
+        ]
+        smooth = gaussian_filter(np.stack(sums, 2), (FIELD_SIGMA, FIELD_SIGMA, 0.0))
+        wanted, own = smooth[..., :3], smooth[..., 3:]
+        few = 1e-3 * own.max(initial=1e-3)
+        field = np.ones((rows, cols, 4), np.float32)
+        field[..., :3] = (wanted + few) / (own + few)
+        bgr[f, slot] *= field[row, col, :3]
+        fields.append(field)
+    return fields, replace(found, bgr=bgr)
 
 
 def fading(faces: I32, label: I32, vertices: int, views: int) -> tuple[I32, F32]:

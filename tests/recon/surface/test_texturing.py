@@ -12,7 +12,7 @@ from sheets import height_mesh
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut, face_neighbours
 from recon.surface.raster import Grid, Raster
-from recon.surface.texture_atlas import BORDER_PX, fill, lay_out, pack
+from recon.surface.texture_atlas import BORDER_PX, fill, images_of, lay_out, pack
 from recon.surface.texture_views import (
     TextureView,
     TriangleViews,
@@ -24,6 +24,7 @@ from recon.surface.texturing import (
     PENALTY,
     SPREAD_RINGS,
     choose,
+    faded_steps,
     fading,
     levels,
     spread_colours,
@@ -103,6 +104,25 @@ def test_differently_exposed_views_leave_no_step_at_their_seam() -> None:
     for channel in range(3):  # one gain and offset fit all of it: no step is left inside
         line = np.polyfit(truth[:, channel], colour[inner, channel], 1)
         assert np.abs(np.polyval(line, truth[:, channel]) - colour[inner, channel]).max() < 8.0
+
+
+def test_views_that_are_brighter_in_one_part_leave_no_step() -> None:
+    mesh = sheet()
+    views = [image(np.array([x, 0.0, 14.0])) for x in (-6.0, 0.0, 6.0)]
+    shade = np.linspace(1.15, 0.85, 320)[:, None]  # no gain of a whole image removes it
+    for view in views:
+        view.bgra[..., :3] = np.clip(view.bgra[..., :3] * shade, 0, 255)
+    found = look(mesh, views)
+    fields, after = faded_steps(mesh, views, found)
+    both = found.view[:, 1] >= 0
+    before_apart, apart = (np.abs(o.bgr[both, 0] - o.bgr[both, 1]).mean() for o in (found, after))
+    assert before_apart > 5.0 and apart < 0.4 * before_apart
+    images = images_of(views, np.zeros((3, 3, 2), np.float32), fields)
+    seen = images.pixels.reshape(3, 240, 320, 4)[:, 40:200, 40:280].astype(float)
+    x = np.arange(40, 280)
+    for view, factor in zip(views, seen[..., :3].mean(axis=(1, 3)), strict=True):
+        own = view.bgra[40:200, 40:280, :3].mean(axis=(0, 2))
+        assert np.polyfit(x, factor / own, 1)[0] > 0.0  # against the shade
 
 
 def test_a_triangle_narrower_than_a_texel_has_colours_all_along() -> None:
@@ -362,9 +382,8 @@ def test_triangles_without_a_view_take_the_colours_of_those_around_them() -> Non
     count = len(mesh.faces)
     found = TriangleViews.none(count)
     found.view[:, 0] = 0
-    found.bgr[:, 0] = [10.0, 20.0, 30.0]
-    gains = np.array([[[2.0, 1.0]] * 3], np.float32)
-    rgb = spread_colours(mesh.faces, mesh.rgb, found, slot, gains)
+    found.bgr[:, 0] = [21.0, 41.0, 61.0]
+    rgb = spread_colours(mesh.faces, mesh.rgb, found, slot)
     x = mesh.vertices_m[:, 0]
     assert (rgb[x < 6.0] == [61, 41, 21]).all()
     far = x > 4.0 + 0.5 * SPREAD_RINGS
