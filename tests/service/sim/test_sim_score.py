@@ -272,7 +272,8 @@ def delivered(scan: Path, flight: Path, shift_east_m: float, shift_up_m: float) 
     options = json.loads((truth.folder / "params.json").read_text())["options"]
     blocks = prepare(options_of(options)).scene.blocks
     houses = blocks[np.isin(blocks[:, shapes.KIND], (shapes.FLAT, shapes.GABLED))]
-    filled = np.any([shapes.inside(house, *xy.T, 1.0) for house in houses], axis=0)
+    x, y = xy.T
+    filled = np.any([shapes.inside(house, x, y, 1.0) for house in houses], axis=0)
     bands = np.stack([height, 0 * height, filled]).reshape(3, *shape)
     with rasterio.open(
         scan / "dsm.tif", "w", driver="GTiff", count=3, dtype="float32", nodata=-9999.0, **place
