@@ -92,7 +92,7 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
     for words in (
         f"grown by {(REFIT_GROWTH - 1) * 100:.0f} % ({(SETTLED_GROWTH - 1) * 100:.0f} % from",
         f"block of {factors.BLOCK} keyframes",
-        f"({factors.SIGMA_STEP} of its length)",
+        f"({records.SIGMA_STEP} of its length)",
         f"{MIN_FIT_SIGMAS} sigmas. Beyond {WILD} sigmas",
         f"claimed, inflated over {ATTITUDE_S:.0f} s",
         f"claimed and inflated over {FIX_S:.0f} s",
