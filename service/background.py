@@ -10,7 +10,7 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
-from threading import Condition, Event
+from threading import Condition, Event, Semaphore
 from typing import Generic, TypeVar
 
 from service.workers import PROCESS
@@ -112,6 +112,7 @@ class BackgroundWorker(Generic[In, Out]):
         self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once
         self.dropped = 0
         self._ends, self._patience_s = Event(), 0.0
+        self._room = Semaphore()  # for one item between the threads: the first is no further ahead
         self._halves = [_Half(row) for row in rows or ()]
         for half in self._halves:
             weakref.finalize(self, half.todo.put, None)  # also when it is never closed
@@ -153,7 +154,7 @@ class BackgroundWorker(Generic[In, Out]):
             return
         self._halves[0].todo.put(partial(self._begin, future))
         waiting = [future for future in self._offered if not future.done()]
-        if len(waiting) <= self._bound + 1:  # one is being worked on
+        if len(waiting) <= self._bound + 1:  # one or more are being worked on
             return
         if not self._live:
             self._wait(waiting[0])
@@ -199,7 +200,15 @@ class BackgroundWorker(Generic[In, Out]):
             rest = self._work(self._offered[future])
         except Exception as error:  # raised where the result is taken
             return partial(future.set_exception, error)
-        return partial(self._halves[1].todo.put, partial(_end, future, rest))
+        return partial(self._hand_over, partial(self._finish, future, rest))
+
+    def _hand_over(self, job: _Job) -> None:
+        self._room.acquire()
+        self._halves[1].todo.put(job)
+
+    def _finish(self, future: Future[Out], rest: Callable[[], Out]) -> Callable[[], object]:
+        self._room.release()
+        return _end(future, rest)
 
 
 def _end(future: Future[Out], rest: Callable[[], Out]) -> Callable[[], object]:

@@ -104,6 +104,23 @@ def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
     assert kept[0] == 0 and kept[-1] == 9 and len(kept) == 3 and jobs.dropped == 7
 
 
+def test_live_the_first_half_is_no_further_ahead_than_the_queue_is_long() -> None:
+    gate, begun = threading.Event(), list[int]()
+
+    def work(n: int) -> Callable[[], int]:
+        begun.append(n)
+        return lambda: n if gate.wait(20) else -1
+
+    jobs = BackgroundWorker(ROWS, work, 3, live=True)
+    for n in range(20):
+        jobs.offer(n)
+        assert until(lambda n=n: jobs.is_free or n >= 3)
+    assert begun == [0, 1, 2] and jobs.dropped == 16
+    gate.set()
+    assert [n for n, _ in jobs.finished(everything=True)] == [0, 1, 2, 19]
+    jobs.close()
+
+
 def test_a_first_depth_that_gives_way_is_no_lost_view() -> None:
     gate = threading.Event()
 
