@@ -223,7 +223,7 @@ class Mapper:
         """One frame of a recording; those that hardly moved are not looked at.
 
         Raises ValueError for an image that is not (H, W, 3) uint8 of the camera model's size, a
-        number or time that is not after the last frame's, or a prior with no rotation or position.
+        number or time that is not after the last frame's, or a prior that cannot be.
         """
         check_image(frame.image, self._size_px)
         check_prior(frame.prior)

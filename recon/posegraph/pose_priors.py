@@ -52,7 +52,9 @@ def check_prior(prior: PosePrior) -> None:
 
 
 def _is_finite(value: object, shape: tuple[int, ...]) -> bool:
-    return isinstance(value, np.ndarray) and value.shape == shape and bool(np.isfinite(value).all())
+    if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in "fiu":
+        return False
+    return bool(np.isfinite(value).all())
 
 
 def sound(prior: PosePrior) -> PosePrior:
@@ -117,6 +119,8 @@ class FixAverage:
         self._fixes += has_fix(prior)
         if self._mean is not None:
             prior = averaged((T_odom_camera, prior), self._mean, 1.0 / max(self._fixes, 1))
+            if prior.fix_offset is None:  # the fixes before are no part of it
+                self._fixes = int(has_fix(prior))
         self._mean = T_odom_camera, prior
 
     def given(self) -> PosePrior:

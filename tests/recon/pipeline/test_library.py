@@ -99,6 +99,7 @@ LOOKS_DOWN = np.diag([1.0, -1.0, -1.0])
         (Frame(IMAGE, 9, 9, PosePrior(-LOOKS_DOWN)), "R_world_camera must be"),
         (Frame(IMAGE, 9, 9, PosePrior(np.array([1.0, 0, 0, 0]))), "R_world_camera must be"),
         (Frame(IMAGE, 9, 9, PosePrior(position_m=np.full(3, np.nan))), "position_m must be"),
+        (Frame(IMAGE, 9, 9, PosePrior(position_m=np.array([None] * 3))), "position_m must be"),
         (Frame(IMAGE, 9, 9, PosePrior(position_m=[1, 2, 3])), "array"),  # type: ignore[arg-type]
     ],
 )

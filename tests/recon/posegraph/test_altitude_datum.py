@@ -102,3 +102,11 @@ def test_nothing_is_carried_over_a_break() -> None:
     given = average.given()
     assert given.fix_offset is None
     assert given.position_m is not None and not given.position_m.any()
+
+
+def test_fixes_much_better_than_those_before_have_a_mean_of_their_own() -> None:
+    average = FixAverage()
+    for sigma_m, x in ((1.0, 9.0), (1.0, 9.0), (1.0, 9.0), (0.02, 1.0), (0.02, 2.0)):
+        fix = PosePrior(position_m=np.full(3, x), sigma_position_m=np.full(3, sigma_m))
+        average.take(np.eye(4), fix)
+    np.testing.assert_allclose(average.given().position_m, 1.5)
