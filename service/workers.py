@@ -66,7 +66,7 @@ ROWS: tuple[Row, ...] = (
     Row("gst", "process: a GStreamer pipeline, and its error messages", 1),
     Row("scan", "one scan: tracking, map and store", 2, deadline_s=_HANG_S),
     Row("dense", "depth of views; a replay waits, drops nothing", 2, 3, DROP, _HANG_S),
-    Row("placing", "pose graph and map of views that have depth", 2, deadline_s=_HANG_S),
+    Row("placing", "pose graph and map of views that have depth", 2, 1, WAIT, _HANG_S),
     Row("coverage", "coverage.png of the growing scan", 2),
     Row("files", "the files of a scan that has ended", 3),
     Row("progress", "says again what a long step of a command does", 3),

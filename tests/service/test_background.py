@@ -112,9 +112,11 @@ def test_live_the_first_half_is_no_further_ahead_than_the_queue_is_long() -> Non
         return lambda: n if gate.wait(20) else -1
 
     jobs = BackgroundWorker(ROWS, work, 3, live=True)
-    for n in range(20):
+    for n in range(3):
         jobs.offer(n)
-        assert until(lambda n=n: jobs.is_free or n >= 3)
+        assert until(lambda: jobs.is_free)
+    for n in range(3, 20):
+        jobs.offer(n)
     assert begun == [0, 1, 2] and jobs.dropped == 16
     gate.set()
     assert [n for n, _ in jobs.finished(everything=True)] == [0, 1, 2, 19]

@@ -109,4 +109,6 @@ def test_fixes_much_better_than_those_before_have_a_mean_of_their_own() -> None:
     for sigma_m, x in ((1.0, 9.0), (1.0, 9.0), (1.0, 9.0), (0.02, 1.0), (0.02, 2.0)):
         fix = PosePrior(position_m=np.full(3, x), sigma_position_m=np.full(3, sigma_m))
         average.take(np.eye(4), fix)
-    np.testing.assert_allclose(average.given().position_m, 1.5)
+    mean = average.given().position_m
+    assert mean is not None
+    np.testing.assert_allclose(mean, 1.5)
