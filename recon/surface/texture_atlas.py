@@ -53,15 +53,16 @@ def lay_out(
     """The atlas of triangles labelled with their view (-1: none), no side above ``largest_px``.
 
     The mesh needs ``rgb``. A chart is a connected piece of one label, as the view sees it; of
-    triangles without a view, as seen along that axis which they face most. Charts are packed in
-    shelves by height, those of like brightness next to each other; when they do not fit, all are
-    scaled down, to MIN_SCALE at least: their borders keep their size, and may need a larger atlas.
+    triangles without a view, as seen from the side of an axis that they face most. Charts are
+    packed in shelves by height, those of like brightness next to each other; when they do not fit,
+    all are scaled down, to MIN_SCALE at least: their borders keep their size, and may need a larger
+    atlas.
     """
     assert mesh.rgb is not None
     label, uv = label.copy(), _seen_uv(mesh, views, label)
     unseen = np.flatnonzero(label < 0)
-    axis, uv[unseen] = _flattened(mesh.vertices_m[mesh.faces], neighbours, unseen)
-    label[unseen] = -1 - axis
+    side, uv[unseen] = _flattened(mesh.vertices_m[mesh.faces], neighbours, unseen)
+    label[unseen] = -1 - side
     chart = _charts(label, neighbours)
     brightness = np.bincount(chart, mesh.rgb[mesh.faces].mean(axis=(1, 2))) / np.bincount(chart)
     scale = _scale_for(uv[label >= 0])
@@ -76,13 +77,15 @@ def lay_out(
 
 
 def _flattened(corners: F64, neighbours: I32, some: I64) -> tuple[I64, F64]:
-    """Of ``some`` triangles (F, 3, 3): the axis (N,) that each faces most, and its corners
-    (N, 3, 2) seen along it, in texels."""
+    """Of ``some`` triangles (F, 3, 3): the side (N,) that each faces most, one of two for each
+    axis, as both sides of a thin wall would lie on each other; its corners (N, 3, 2) seen along
+    that axis, in texels."""
     area, normal = steady_normals(corners, neighbours)
     axis = np.asarray(np.abs(normal[some]).argmax(axis=1), np.int64)
+    side = 2 * axis + (normal[some, axis] < 0.0)
     others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
     texels = np.sqrt(UNSEEN_TEXELS * len(some) / max(float(area[some].sum()), 1e-9))
-    return axis, np.take_along_axis(corners[some], others[:, None], axis=2) * texels
+    return side, np.take_along_axis(corners[some], others[:, None], axis=2) * texels
 
 
 def _scale_for(uv: F64) -> float:
