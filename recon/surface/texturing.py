@@ -68,7 +68,7 @@ def texture(
     label = np.where(slot >= 0, found.view[np.arange(len(slot)), slot], -1).astype(np.int32)
     progress("levelling exposures")
     gains = levels(found, len(views))
-    fields, found = faded_steps(mesh, views, levelled(found, gains))
+    fields, found = faded_steps(mesh, views, found, gains)
     fade_view, fade_share = fading(mesh.faces, label, len(mesh.vertices_m), len(views))
     progress("packing the atlas")
     rgb = spread_colours(mesh.faces, mesh.rgb, found, slot)
@@ -251,6 +251,9 @@ ones, as under a cloud, do not make all others brighter or darker."""
 FIELD_CELLS, FIELD_SIGMA = 24, 1.7
 """Along the longer side of an image, of the field of its brightness, and how smooth that is."""
 
+LARGEST_FACTOR = 2.0
+"""Of that field: in what is all but black, a ratio of brightnesses says nothing."""
+
 FADE_RINGS = 4
 """Rings of triangles on each side of a seam across which the views fade."""
 
@@ -360,17 +363,20 @@ def levelled(found: TriangleViews, gains: F32) -> TriangleViews:
 
 
 def faded_steps(
-    mesh: Mesh, views: Sequence[TextureView], found: TriangleViews
+    mesh: Mesh, views: Sequence[TextureView], found: TriangleViews, gains: F32
 ) -> tuple[list[F32], TriangleViews]:
-    """For each view (rows, cols, 4) factors over its image that take it to the mean of what all
-    levelled views show of a place, and ``found`` with these colours.
+    """For each view (rows, cols, 4) factors over its image, before its gains (views, 3, 2), that
+    take it to the mean of what all views of a place show after theirs; ``found`` after both.
 
     One gain for an image leaves steps where haze, a cloud's edge or the lens make it brighter in
-    one part only. A factor is of surroundings as wide as FIELD_SIGMA, so details stay.
+    one part only. A factor is of surroundings as wide as FIELD_SIGMA, so details stay. Where no
+    other view sees a place, it is 1.
     """
     a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
     middle, area = (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    mean = found.bgr.sum(axis=1) / np.maximum((found.view >= 0).sum(axis=1), 1)[:, None]
+    is_seen = found.view >= 0  # views that were dropped leave their colours behind
+    total = (levelled(found, gains).bgr * is_seen[..., None]).sum(axis=1)
+    mean = total / np.maximum(is_seen.sum(axis=1), 1)[:, None]
     bgr, fields = found.bgr.copy(), []
     for number, view in enumerate(views):
         f, slot = np.nonzero(found.view == number)
@@ -379,18 +385,20 @@ def faded_steps(
         place = (projected(view, middle[f]) + 0.5) * [cols / w, rows / h]
         col, row = np.clip(place.astype(np.int64), 0, [cols - 1, rows - 1]).T
         weight = area[f] * found.px_per_m[f, slot] ** 2
+        before_gain = (mean[f] - gains[number, :, 1]) / np.maximum(gains[number, :, 0], 1e-3)
         sums = [
             np.bincount(row * cols + col, weight * colour, rows * cols).reshape(rows, cols)
-            for colour in (*mean[f].T, *found.bgr[f, slot].T)
+            for colour in (*before_gain.T, *found.bgr[f, slot].T)
         ]
         smooth = gaussian_filter(np.stack(sums, 2), (FIELD_SIGMA, FIELD_SIGMA, 0.0))
         wanted, own = smooth[..., :3], smooth[..., 3:]
-        few = 1e-3 * own.max(initial=1e-3)
+        few = 1e-3 * max(float(own.max()), 1e-3)
         field = np.ones((rows, cols, 4), np.float32)
-        field[..., :3] = (wanted + few) / (own + few)
+        factor = (wanted + few) / (own + few)
+        field[..., :3] = np.clip(factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
         bgr[f, slot] *= field[row, col, :3]
         fields.append(field)
-    return fields, replace(found, bgr=bgr)
+    return fields, levelled(replace(found, bgr=bgr), gains)
 
 
 def fading(faces: I32, label: I32, vertices: int, views: int) -> tuple[I32, F32]:

@@ -30,7 +30,7 @@ from recon.surface.texturing import (
     spread_colours,
     texture,
 )
-from recon.types import F64, U8, Array
+from recon.types import F32, F64, U8, Array
 
 NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 K = np.array([[200.0, 0.0, 159.5], [0.0, 200.0, 119.5], [0.0, 0.0, 1.0]])
@@ -113,7 +113,7 @@ def test_views_that_are_brighter_in_one_part_leave_no_step() -> None:
     for view in views:
         view.bgra[..., :3] = np.clip(view.bgra[..., :3] * shade, 0, 255)
     found = look(mesh, views)
-    fields, after = faded_steps(mesh, views, found)
+    fields, after = faded_steps(mesh, views, found, as_they_are(3))
     both = found.view[:, 1] >= 0
     before_apart, apart = (np.abs(o.bgr[both, 0] - o.bgr[both, 1]).mean() for o in (found, after))
     assert before_apart > 5.0 and apart < 0.4 * before_apart
@@ -123,6 +123,51 @@ def test_views_that_are_brighter_in_one_part_leave_no_step() -> None:
     for view, factor in zip(views, seen[..., :3].mean(axis=(1, 3)), strict=True):
         own = view.bgra[40:200, 40:280, :3].mean(axis=(0, 2))
         assert np.polyfit(x, factor / own, 1)[0] > 0.0  # against the shade
+
+
+def as_they_are(views: int) -> F32:
+    """Gains that change nothing."""
+    return np.tile(np.array([1.0, 0.0], np.float32), (views, 3, 1))
+
+
+def test_what_stood_before_one_image_leaves_the_brightness_of_the_others() -> None:
+    mesh = sheet()
+    views = [image(np.array([x, 0.0, 14.0])) for x in (-2.0, -1.0, 0.0, 1.0, 2.0)]
+    views[2].bgra[60:180, 80:240, :3] = 255  # left out by the next line
+    found = consistent(look(mesh, views))
+    fields, _ = faded_steps(mesh, views, found, as_they_are(5))
+    for number in (0, 1, 3, 4):
+        assert np.abs(fields[number] - 1.0).max() < 0.02
+
+
+def test_an_image_that_no_other_overlaps_stays_as_it_is() -> None:
+    mesh = sheet()
+    for eyes in ([0.0], [-60.0, 0.0, 60.0]):
+        views = [image(np.array([x, 0.0, 14.0])) for x in eyes]
+        fields, after = faded_steps(mesh, views, look(mesh, views), as_they_are(len(views)))
+        assert all((field == 1.0).all() for field in fields)
+        assert (after.bgr == look(mesh, views).bgr).all()
+
+
+@pytest.mark.parametrize(("level", "offset"), [(100, -30.0), (20, -40.0), (0, 20.0)])
+def test_a_field_and_the_gain_after_it_end_at_the_mean(level: int, offset: float) -> None:
+    mesh = sheet()
+    views = [image(np.array([x, 0.0, 14.0])) for x in (-0.5, 0.5)]
+    for view in views:
+        view.bgra[..., :3] = level
+    gains = as_they_are(2)
+    gains[1, :, 1] = offset
+    found = look(mesh, views)
+    fields, after = faded_steps(mesh, views, found, gains)
+    assert np.min(fields) >= 0.5 and np.max(fields) <= 2.0
+    images = images_of(views, gains, fields)
+    shows = images.pixels.reshape(2, 240, 320, 4)[:, 120, 160, :3] + gains[:, :, 1]
+    both = (found.view[:, 1] >= 0) & (np.abs(mesh.vertices_m[mesh.faces]).max(axis=(1, 2)) < 2.0)
+    for number in range(2):
+        colours = after.bgr[both][found.view[both] == number]
+        np.testing.assert_allclose(colours, np.broadcast_to(shows[number], colours.shape), atol=1.5)
+    if level == 100:
+        np.testing.assert_allclose(shows, 85.0, atol=1.5)
 
 
 def test_a_triangle_narrower_than_a_texel_has_colours_all_along() -> None:
@@ -344,6 +389,17 @@ def test_weights_fade_across_a_seam() -> None:
     means = [of_one[np.abs(x - at) < 0.01].mean() for at in np.unique(np.round(x, 3))]
     assert means[0] == 0.0 and means[-1] == 1.0
     assert (np.diff(means) >= -1e-6).all() and np.diff(means).max() < 0.35
+
+
+def test_both_sides_of_a_thin_wall_that_no_view_sees_have_their_own_texels() -> None:
+    vertices = np.array(
+        [[0.0, 0, 0], [0, 2, 0], [0.1, 0, 0], [0.1, 2, 0], [0.05, 0, 2], [0.05, 2, 2]]
+    )
+    faces = np.array([[0, 4, 1], [1, 4, 5], [2, 3, 4], [3, 5, 4]], np.int32)
+    rgb = np.full((6, 3), 128, np.uint8)
+    mesh, unseen = Mesh(vertices, faces, None, rgb), np.full(4, -1, np.int32)
+    chart = lay_out(mesh, [], unseen, face_neighbours(faces), 64).chart
+    assert chart[0] == chart[1] != chart[2] == chart[3]
 
 
 def test_charts_do_not_overlap_and_fit() -> None:
