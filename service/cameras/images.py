@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.types import U8, Array
+from recon.types import F64, U8, Array
 from service.cameras import UNREAD, how_to_convert, reject_options
 from service.cameras.exif import DEFAULT_SIGMA_H_M, Tags, read_tags
 from service.cameras.geo_file import geo_file_of, read_geo
@@ -143,15 +143,16 @@ class ImagesSource(CameraSource):
         import cv2
 
         if self._black_white is None:
-            some = [one for one in map(_deep, self._some) if one is not None]
-            alike = [one for one in some if one.dtype == image.dtype]
-            self._black_white = low, high = black_and_white(alike or [image])
+            some = (one for one in map(_deep, self._some) if one is not None)  # one is held
+            ends = [_ends(one) for one in some if one.dtype == image.dtype] or [_ends(image)]
+            self._black_white = low, high = black_and_white(ends)
             if not self._is_photo(image):
                 self._warn(f"levels of the images from {low:.5g} to {high:.5g} are black to white")
         if self._is_photo(image):
             return _decoded(path, cv2.IMREAD_COLOR)
         low, high = self._black_white
-        share = (image.astype(np.float32) - low) * (255.0 / (high - low))
+        with np.errstate(over="ignore", invalid="ignore"):  # foreign floats may be any
+            share = (image.astype(np.float32) - low) * (255.0 / (high - low))
         shown = np.nan_to_num(share).clip(0.0, 255.0).astype(np.uint8)
         return shown if shown.ndim == 3 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR))
 
@@ -586,9 +587,19 @@ def _decoded(path: Path, flags: int) -> Array | None:
         return None
 
 
-def black_and_white(images: Iterable[Array]) -> tuple[float, float]:
-    """The levels of deep images that 8 bits show as 0 and 255."""
-    ends = np.array([np.nanpercentile(image[::4, ::4], SHOWN) for image in images])
-    low, high = float(np.nanmin(ends[:, 0])), float(np.nanmax(ends[:, 1]))
-    more = WIDER * max(high - low, 1e-3)
+def _ends(image: Array) -> F64:
+    """(2,) the darkest and the brightest level of a deep image that are shown; NaN without any.
+
+    Infinity, as some write it where nothing is known, is no level.
+    """
+    few = image[::4, ::4].astype(np.float64)
+    known = few[np.isfinite(few)]
+    return np.percentile(known, SHOWN) if known.size else np.full(2, np.nan)
+
+
+def black_and_white(ends: Iterable[F64]) -> tuple[float, float]:
+    """The levels that 8 bits show as 0 and 255, of the ``ends`` of deep images."""
+    found = np.array([end for end in ends if np.isfinite(end).all()] or [np.zeros(2)])
+    low, high = float(found[:, 0].min()), float(found[:, 1].max())
+    more = WIDER * max(high - low, 1e-3, 1e-6 * abs(low))
     return low - more, high + more

@@ -763,6 +763,20 @@ def test_degrees_in_floats_are_seen_and_what_is_unknown_is_black(tmp_path: Path)
     assert frame.image[:10, :10].max() == 0 and np.ptp(frame.image[20:]) > 60
 
 
+@pytest.mark.parametrize("odd", [np.inf, -np.inf, 3e38])
+def test_levels_are_those_of_what_is_known(tmp_path: Path, odd: float) -> None:
+    degrees = np.linspace(11.0, 29.0, 4800, dtype=np.float32).reshape(60, 80)
+    unlike = degrees.copy()
+    unlike[:] = odd  # all of one image
+    if not np.isfinite(odd):
+        degrees[:10, :10] = odd
+    for name, image in (("a", degrees), ("b", unlike), ("c", degrees)):
+        cv2.imwrite(str(tmp_path / f"{name}.tif"), image)
+    first, _, third = open_camera(str(tmp_path))
+    assert np.array_equal(first.image, third.image)
+    assert np.isfinite(odd) or np.ptp(first.image[20:]) > 60
+
+
 @pytest.mark.parametrize("kind", ["png", "tif"])
 def test_a_photo_of_16_bits_is_shown_whole(tmp_path: Path, kind: str) -> None:
     photo = np.random.default_rng(0).integers(0, 1 << 16, (60, 80, 3)).astype(np.uint16)
