@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import json
 import os
@@ -32,10 +33,16 @@ def writing(path: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Write a file, or the names in a folder, through to the disk; OSError when it fails."""
+    """Write a file, or the names in a folder, through to the disk; OSError when it fails.
+
+    Some network file systems cannot do so for a folder: there the names are written when they are.
+    """
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
+            raise
     finally:
         os.close(handle)
 

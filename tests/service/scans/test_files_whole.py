@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 import subprocess
 import sys
 import threading
 from pathlib import Path
 
-from service.scans.writing import writing, writing_folder
+import pytest
+
+from service.errors import OutsideError
+from service.scans.writing import write_whole, writing, writing_folder
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
@@ -71,3 +77,26 @@ def test_files_that_only_look_like_ours_stay(tmp_path: Path) -> None:
     with writing(tmp_path / "dsm.tif") as part:
         part.write_text("whole")
     assert {p.name for p in tmp_path.iterdir()} == {*names, "dsm.tif"}
+
+
+def test_a_file_system_that_cannot_sync_folders_takes_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sync = os.fsync
+
+    def of_files_alone(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files_alone)
+    write_whole(tmp_path / "a", "whole")
+    assert (tmp_path / "a").read_text() == "whole"
+
+    def broken(_: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fsync", broken)
+    with pytest.raises(OutsideError, match="Input/output"):
+        write_whole(tmp_path / "a", "other")
+    assert (tmp_path / "a").read_text() == "whole"
