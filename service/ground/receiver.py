@@ -375,12 +375,14 @@ class Receiver:
                 self._writes.put((effect, one))
             case drone.Opened(scan):
                 self._opened(scan)
-            case drone.Put() if session is not None:
-                with contextlib.suppress(zenoh.ZError):
-                    session.put(*effect, priority=high, congestion_control=DROP, express=True)
-            case drone.Get() if session is not None:
-                with contextlib.suppress(zenoh.ZError):
-                    self._ask(session, one, effect)
+            case drone.Put() | drone.Get() if session is not None:
+                try:
+                    if isinstance(effect, drone.Get):
+                        self._ask(session, one, effect)
+                    else:
+                        session.put(*effect, priority=high, congestion_control=DROP, express=True)
+                except zenoh.ZError as error:
+                    log.debug("%s is not sent: %s", effect.key, error)
 
     def _ask(self, session: zenoh.Session, one: Drone, request: drone.Get) -> None:
         """Send a request. One beyond the drone's share is over at once, so that it is made again
