@@ -24,27 +24,11 @@ MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
 points of one depth map have in common does not average out."""
 
+SEARCH_SHARE = 0.12
+"""Search radius about the places that the graph predicts, as a share of the image's width."""
 
-@dataclass(frozen=True, slots=True)
-class LoopConfig:
-    """What two keyframes must have in common."""
-
-    matching: matching.MatchingConfig
-    search_shares: tuple[float, ...]  # radii about the predicted places, shares of the width
-    by_features: bool  # where those are too far off, the features of both images predict
-    min_matches: int  # that one motion explains
-    min_share: float  # of all matches
-
-
-IN_FLIGHT = LoopConfig(matching.DEFAULT, (0.12,), True, 30, 0.5)
-"""Images are whole, and the track may be far off."""
-
-FINISHED = LoopConfig(
-    matching.MatchingConfig(grid=50, ambiguity=0.9, max_zssd=0.6, max_return_px=0.7),
-    (0.03, 0.1), False, 14, 0.6,
-)  # fmt: skip
-"""The track is near the truth already, so fewer matches do: little of oblique views from opposite
-sides is alike."""
+MIN_MATCHES, MIN_INLIERS, MIN_INLIER_SHARE = 40, 30, 0.5
+"""Corners found again, and those of them that the pose explains, and their share."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,40 +103,38 @@ def candidates(
     )
 
 
-def verify(
-    a: LoopEnd, b: LoopEnd, T_a_b_guess: F64, config: LoopConfig = IN_FLIGHT
-) -> LoopClosure | None:
+def verify(a: LoopEnd, b: LoopEnd, T_a_b_guess: F64) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
-    ``T_a_b_guess`` (4, 4) is the pose graph's estimate.
+    ``T_a_b_guess`` (4, 4) is the pose graph's estimate. Where it is too far off, the features that
+    both images share predict instead.
     """
-    uv, points = landmarks(a, config.matching)
-    if len(uv) < config.min_matches:
+    uv, points = landmarks(a, matching.DEFAULT)
+    if len(uv) < MIN_MATCHES:
         return None
     pyramids = [matching.build_pyramid(v.gray) for v in (a, b)]
     T_b_a = se3.inverse(T_a_b_guess)
-    for predicted, warp, prior, share in _predictions(a, b, T_b_a, uv, points, config):
+    for predicted, warp, prior, share in _predictions(a, b, T_b_a, uv, points):
         radius = share * b.gray.shape[1]
-        found = matching.match(
-            pyramids[0], uv, pyramids[1], predicted, radius, warp, config.matching
-        )
+        found = matching.match(pyramids[0], uv, pyramids[1], predicted, radius, warp)
+        if np.count_nonzero(found.ok) < MIN_MATCHES:
+            continue
         seen = found.uv_px[found.ok].astype(np.float64)
-        solved = pnp.solve(points[found.ok], seen, b.K, prior, min_inliers=config.min_matches)
-        if solved is not None and solved.inlier_share >= config.min_share:
+        solved = pnp.solve(points[found.ok], seen, b.K, prior, min_inliers=MIN_INLIERS)
+        if solved is not None and solved.inlier_share >= MIN_INLIER_SHARE:
             T_a_b = se3.inverse(solved.T_camera_points)
             return _with_icp(a, b, T_a_b, se3.left_covariance(T_a_b, solved.covariance))
     return None
 
 
 def _predictions(
-    a: LoopEnd, b: LoopEnd, T_b_a: F64, uv: F64, points: F64, config: LoopConfig
+    a: LoopEnd, b: LoopEnd, T_b_a: F64, uv: F64, points: F64
 ) -> Iterator[tuple[F64, F64, F64 | None, float]]:
     """Where b may see a's landmarks (N, 2), how offsets about them change (N, 2, 2), b's pose if it
     is known, and the search radius as a share of the width; made when it is asked for."""
     predicted, warp = project(b.K, se3.transform(T_b_a, points)), warps(a.K, b.K, T_b_a, uv, points)
-    for share in config.search_shares:
-        yield predicted, warp, T_b_a, share
-    shared = match_features(features(a.gray), features(b.gray)) if config.by_features else None
+    yield predicted, warp, T_b_a, SEARCH_SHARE
+    shared = match_features(features(a.gray), features(b.gray))
     if shared is not None:
         there, warp = shared.predict(uv)
         for share in FEATURE_SHARES:

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon import se3
-from recon.posegraph.filled_view import filled
 from recon.posegraph.ground_control import KeyframeTrack
-from recon.posegraph.loop_closure import FINISHED, LoopEnd, candidates, ground_seen, verify
+from recon.posegraph.loop_closure import LoopEnd, candidates, ground_seen
 from recon.posegraph.records import Loop
+from recon.posegraph.submap_loops import filled, verify_surfaces
 from recon.types import F64, Keyframe
 from service.progress import Progress
 
@@ -89,7 +89,7 @@ def verified(
     """The loop between the keyframes ``a`` and ``b``, by what they see."""
     if ends[0] is None or ends[1] is None:
         return None
-    found = verify(ends[0], ends[1], guess, FINISHED)
+    found = verify_surfaces(ends[0], ends[1], guess)
     if found is None:
         return None
     T_a_b, covariance, growth = found

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.posegraph.filled_view import points_of
+from recon.posegraph.submap_loops import points_of
 from recon.surface.change import (
     Body,
     Change,
