@@ -53,6 +53,9 @@ class FallbackBackend:
         self._backend, self._one = backend, Lock()
         self.failure: str | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:  # a lock cannot be copied
+        return type(self), (self._backend,), {"failure": self.failure}
+
     def __getattr__(self, name: str) -> Any:
         """What the backend has under this name; an operation falls back."""
         if name == "_backend":  # while it is copied
