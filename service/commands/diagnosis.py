@@ -313,10 +313,10 @@ def check_certificate(config: Config) -> Iterator[Finding]:
     if name != drone:
         text = f"{path} is of {name!r}, scan.drone is {drone!r}: the ground would refuse its data"
         yield Finding("certificate", BAD, text)
-    elif left_days < 0:
+    if left_days < 0:
         text = f"{path} expired {-left_days:.0f} days ago; make new keys with 'skyrelief keys'"
         yield Finding("certificate", BAD, text)
-    else:
+    elif name == drone:
         verdict = GOOD if left_days > SOON_DAYS else NOTE
         yield Finding("certificate", verdict, f"{path} is valid for {left_days:.0f} more days")
 

@@ -201,10 +201,8 @@ class LiveMap:
         if image is not None and len(cloud):
             cloud = joined([cloud, unmeasured(keyframe, image)])
         order = np.argsort(-cloud.sigma_m)
-        place, sigma = (
-            on_map(self._frame, cloud.xyz_m[order].astype(np.float64)),
-            cloud.sigma_m[order],
-        )
+        sigma = cloud.sigma_m[order]
+        place = on_map(self._frame, cloud.xyz_m[order].astype(np.float64))
         height = np.where(sigma < UNMEASURED_M, place[:, 2], np.nan).astype(np.float32)
         return _Points(place[:, :2], height, sigma, cloud.rgb[order])
 

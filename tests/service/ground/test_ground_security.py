@@ -209,14 +209,16 @@ def test_doctor_tells_how_long_a_certificate_holds(tmp_path: Path) -> None:
         make_keys(tmp_path / "fleet", {"drone": ["red"]}, days=10, now=now)
         chosen = tmp_path / "fleet" / "drone" / "red" / path
         config = load_config(None, [f"datalink.tls_certificate={chosen}", f"scan.drone={drone}"])
-        (finding,) = check_certificate(config)
-        return finding.verdict, finding.text
+        findings = list(check_certificate(config))
+        assert {finding.verdict for finding in findings} == {findings[0].verdict}
+        return findings[0].verdict, "; ".join(finding.text for finding in findings)
 
     assert found(90.5)[0] == GOOD and "is valid for 90 more days" in found(90.5)[1]
     assert found(5.5)[0] == NOTE
     assert found(-5.5)[0] == BAD and "expired" in found(-5.5)[1]
     assert found(90.0, "key.pem")[0] == BAD
     assert found(90.0, drone="blue")[0] == BAD and "of 'red'" in found(90.0, drone="blue")[1]
+    assert all(fault in found(-5.5, drone="blue")[1] for fault in ("of 'red'", "expired"))
     assert not list(check_certificate(load_config(None, [])))
 
 
