@@ -20,7 +20,7 @@ from portal_client import NEEDS, TOKEN, VEHICLE_SHOWN, browser, flown_store, lis
 from rehearsal import RehearsalVehicle
 from site_scans import Box, Errors, leg, write_scan
 
-from recon.types import Keyframe
+from recon.types import I64, Keyframe
 from service.ground.live_site import FILE, Follower
 from service.ground.portal import Portal, PortalConfig
 from service.ground.vehicle import Vehicle
@@ -172,8 +172,12 @@ def test_a_finished_scan_opens_as_its_mesh(browser: Browser, portal: Portal, sca
     browser.click("Mesh")
     browser.wait("document.body.dataset.mesh === 'shown'")
     assert not browser.run("document.querySelector('.legend').checkVisibility()")
+    browser.wait("document.body.dataset.still === 'yes'")
+    assert purple(browser) == 0, "the ground around the mesh is not drawn by height"
     browser.click("Measured only")
     browser.wait(f"{PRESSED} === 'Surface,Measured only'")
+    browser.wait("document.body.dataset.still === 'yes'")
+    assert purple(browser) > 0
     browser.click("Mesh")
     browser.wait(f"{PRESSED} === 'Mesh'")
     later = time.time() + 5
@@ -187,11 +191,22 @@ def test_a_finished_scan_opens_as_its_mesh(browser: Browser, portal: Portal, sca
     browser.wait(f"{PRESSED} === 'Surface'")
 
 
-def roof_red(browser: Browser) -> float:
-    """How bright the red roof is drawn, 0 to 255: (40, 40, 200) in the scan; 0 if none is seen."""
+def drawn(browser: Browser) -> I64:
+    """(h, w, 3) the view, BGR."""
     script = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
     data = np.frombuffer(base64.b64decode(browser.run(script)), np.uint8)
-    image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.int64)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.int64)
+
+
+def purple(browser: Browser) -> int:
+    """Pixels in the colour of the lowest heights."""
+    blue, green, red = np.moveaxis(drawn(browser), -1, 0)
+    return int(((blue > green + 40) & (red > green + 30)).sum())
+
+
+def roof_red(browser: Browser) -> float:
+    """How bright the red roof is drawn, 0 to 255: (40, 40, 200) in the scan; 0 if none is seen."""
+    image = drawn(browser)
     red = image[image[..., 2] > 2 * image[..., 1]]
     if len(red) <= 100:
         return 0.0

@@ -238,6 +238,7 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): { elements: HTMLEle
       time.toEnd();
     }
     colour.value = isProduct ? "colour" : by;
+    cloud.colour(colour.value as Colour); // also of the ground around a product
     parts.legend.classList.toggle("off", isProduct);
     measured.disabled = layer === "points";
     stage.touch();
