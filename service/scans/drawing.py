@@ -45,12 +45,17 @@ class Maps(NamedTuple):
     cell_m: float  # of the surface
 
 
+SCREEN = 16 / 9
+"""Width over height; of panels wider than that, the image is nearer to it with one above the
+other."""
+
+
 def side_by_side(maps: Maps, lines: Sequence[str]) -> U8:
     """(h, w, 3) BGR image of both panels, above each other where they are wide, over the key
     figures ``lines``."""
     colour, height, _ = maps
     h, w = colour.shape[:2]
-    stacked = w > 1.3 * h
+    stacked = w > SCREEN * h
     gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
     both = np.concatenate([colour, gap, height], axis=0 if stacked else 1)
     return _with_lines(both, lines, _growth(colour))
