@@ -58,8 +58,6 @@ class FallbackBackend:
 
     def __getattr__(self, name: str) -> Any:
         """What the backend has under this name; an operation falls back."""
-        if name == "_backend":  # while it is copied
-            raise AttributeError(name)
         found = getattr(self._backend, name)
         return partial(self._run, name) if callable(found) else found
 

@@ -132,7 +132,8 @@ class Portal:
         elif job.kind == KIND:
             if job.state == "cancelled":
                 drop(job.folder)
-            MESH.end(job.folder)
+            else:
+                MESH.end(job.folder)
             if self.config.meshes:
                 self._queue_meshes()
 

@@ -54,7 +54,7 @@ SLOW = 1000
 GROWTH_MIB = 50.0
 POSE_S, TIMES, LATE_S = 2.0 if WHOLE else 20.0, 3.0, 30.0 if WHOLE else 3.0
 """The oldest honest pose at a ground that is attacked: so many seconds, or where other programs
-take the cores so many times the oldest one that came meanwhile to a ground that nobody attacks.
+take the cores so many times the oldest one that came meanwhile to a ground without an attack.
 What was held up may come so long after the attack."""
 EXPORTS = ("laz", "coverage", "dsm", "3dtiles", "kml", "mcap", "colmap", "ply", "contours")
 COMMANDS = (
@@ -100,7 +100,7 @@ def cage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cage]:
 
 @pytest.fixture
 def calm(tmp_path: Path) -> Iterator[Watch]:
-    """The poses at a ground that nobody attacks: what other programs do to a trial."""
+    """The poses at a ground without an attack: what other programs do to a trial."""
     folder = tmp_path / "calm"
     folder.mkdir()
     with Ground(folder) as ground, HonestDrone(folder, "calm", ground.endpoint):

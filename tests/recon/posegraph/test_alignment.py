@@ -219,9 +219,9 @@ def test_a_compass_wrong_by_half_a_turn_yields_to_the_fixes() -> None:
     assert found.scale == pytest.approx(1.5, rel=0.05)
 
 
-@pytest.mark.parametrize("jumped, most_m", [(range(10, 20), 1.0), (range(17, 30), 2.0)])
+@pytest.mark.parametrize("jumped, max_m", [(range(10, 20), 1.0), (range(17, 30), 2.0)])
 def test_fixes_that_jump_for_two_fifths_of_the_flight_do_not_shift_it(
-    jumped: range, most_m: float
+    jumped: range, max_m: float
 ) -> None:
     """By 37 m; without the last ones the end is carried on."""
     good = noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed=6)
@@ -235,7 +235,7 @@ def test_fixes_that_jump_for_two_fifths_of_the_flight_do_not_shift_it(
     assert a is not None and b is not None
     for i in (0, 15, 29):
         apart = a.pose(good[i].T_odom_camera) - b.pose(good[i].T_odom_camera)
-        assert np.linalg.norm(apart[:3, 3]) < most_m
+        assert np.linalg.norm(apart[:3, 3]) < max_m
 
 
 @pytest.mark.parametrize("wrong", [1.0, 1.2])

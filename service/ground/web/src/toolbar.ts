@@ -237,8 +237,9 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): { elements: HTMLEle
       only(false);
       time.toEnd();
     }
+    const was = colour.value;
     colour.value = isProduct ? "colour" : by;
-    cloud.colour(colour.value as Colour); // also of the ground around a product
+    if (colour.value !== was) cloud.colour(colour.value as Colour); // also of the ground around a product
     parts.legend.classList.toggle("off", isProduct);
     measured.disabled = layer === "points";
     stage.touch();
