@@ -9,11 +9,8 @@ import numpy as np
 
 from recon.types import F32, U8, Bool
 
-WANTED_SPREAD = 45.0
-"""Standard deviation in gray levels that an image of a well-lit scene has."""
-
-MAX_GAIN = 8.0
-"""Beyond it noise is all that grows."""
+WANTED_SPREAD = 45.0  # standard deviation in gray levels that an image of a well-lit scene has
+MAX_GAIN = 8.0  # beyond it noise is all that grows
 
 
 def halved(image: U8, ratio: float) -> U8:
@@ -64,11 +61,8 @@ def sharpness(gray: U8) -> float:
     return fine / coarse if coarse > 0 else float("nan")
 
 
-BLURRED_SHARE = 0.6
-"""Of the median sharpness of the last images: less is blurred."""
-
-BLUR_WINDOW, MIN_KNOWN = 31, 5
-"""Images that the median is of, at most and at least."""
+BLURRED_SHARE = 0.6  # of the median sharpness of the last images: less is blurred
+BLUR_WINDOW, MIN_KNOWN = 31, 5  # images that the median is of, at most and at least
 
 
 class BlurWatch:

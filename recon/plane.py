@@ -6,8 +6,7 @@ import numpy as np
 
 from recon.types import F64
 
-ROUNDS = 8
-"""Fits of a plane, each with the weights of the one before."""
+ROUNDS = 8  # fits of a plane, each with the weights of the one before
 
 MIN_WIDTH = 0.02
 """Of points across their longest side, of that; fewer are in a line, which is in many planes."""

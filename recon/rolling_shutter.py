@@ -19,15 +19,13 @@ from recon import se3
 from recon.camera_model import rays
 from recon.types import F64, Camera, PosePrior
 
-NEAR_S = 0.25
-"""Frames further apart do not show the rotation within a readout."""
+NEAR_S = 0.25  # frames further apart do not show the rotation within a readout
 
 SHORT = 1.7
 """Times the change by one more neighbour that a rate errs: 1.6 with 5 frames a second and 3 with 15
 on simulated flights; 1 to 1.8 by noise alone."""
 
-UNKNOWN_RAD_S = 0.1
-"""Sigma of a turn of which nothing is known."""
+UNKNOWN_RAD_S = 0.1  # sigma of a turn of which nothing is known
 
 STEADY_S = 0.15
 """All frames within it shape the motion; of those further away the two nearest on each side."""

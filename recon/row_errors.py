@@ -12,8 +12,7 @@ from recon.rolling_shutter import Rows
 from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F32, F64
 
-CELLS = 16, 9
-"""Columns and rows in which an image is divided."""
+CELLS = 16, 9  # columns and rows in which an image is divided
 
 
 def turn_shares(

@@ -24,8 +24,7 @@ Bool = npt.NDArray[np.bool_]
 Array = npt.NDArray[Any]
 
 
-DIRECTIONS = ("down", "up", "right", "left")
-"""Ways in which a rolling shutter moves over the image."""
+DIRECTIONS = ("down", "up", "right", "left")  # ways in which a rolling shutter moves over the image
 
 OPPOSITE = {"down": "up", "up": "down", "right": "left", "left": "right"}
 

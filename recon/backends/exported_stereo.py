@@ -20,8 +20,7 @@ from recon.stereo.belief_propagation import RADIUS, BeliefPropagationConfig
 from recon.stereo.matching_cost import CENSUS_OFFSETS, CENSUS_REACH, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
 
-FAR = 1.0e6
-"""More than any cost or sum of costs."""
+FAR = 1.0e6  # more than any cost or sum of costs
 
 OPSET = 17
 

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from recon.backends.torch_icp import DeviceIcp
     from recon.mapping.registration import IcpConfig
 
-KEPT_PLANS = 8
-"""Shapes whose buffers (and CUDA graph) are kept."""
+KEPT_PLANS = 8  # shapes whose buffers (and CUDA graph) are kept
 
 
 class TorchBackend:

@@ -32,11 +32,8 @@ from recon.stereo.message_passing import FULL_WEIGHT
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import RANGE_FLOOR, UpsamplingConfig
 
-PIXELS = 128
-"""Pixels of one program that holds one number each."""
-
-CELLS = 32
-"""Pixels of one program that holds all labels of each."""
+PIXELS = 128  # pixels of one program that holds one number each
+CELLS = 32  # pixels of one program that holds all labels of each
 
 
 def stereo(
@@ -298,8 +295,7 @@ def sweep(
     )  # fmt: skip
 
 
-SWEPT, SWEEP_WARPS = 16, 1
-"""Pixels of one program of a sweep, and its warps."""
+SWEPT, SWEEP_WARPS = 16, 1  # pixels of one program of a sweep, and its warps
 
 
 @triton.jit
@@ -633,8 +629,7 @@ def measure_kernel(own, level, count, height, width, step, unknown, many, PIXELS
     tl.atomic_add(count + index, tl.where(mixed, many, 1), mask=inside)
 
 
-ROWS, COLUMNS = 4, 64
-"""Fine pixels of one program."""
+ROWS, COLUMNS = 4, 64  # fine pixels of one program
 
 LOG2_E = 1 / math.log(2)
 

@@ -29,20 +29,11 @@ from recon.mapping.registration import (
     WEAK_SLOPE,
 )
 
-POINTS = 128
-"""Points of one program."""
-
-ROW = 83
-"""Numbers of a row of sums: H, H with the source's normals on one side, g, sums, partners."""
-
-MEDIAN_OF = 4000
-"""About so many residuals give the scale of all."""
-
-SHARED = 0.35
-"""A direction counts when this share of its information is common to both surfaces."""
-
-SIGN_ROUNDS = 26
-"""A round takes a small eigenvalue 1.5 times nearer to one: to 3e-5 of the largest."""
+POINTS = 128  # points of one program
+ROW = 83  # numbers of a row of sums: H, H with the source's normals on one side, g, sums, partners
+MEDIAN_OF = 4000  # about so many residuals give the scale of all
+SHARED = 0.35  # a direction counts when this share of its information is common to both surfaces
+SIGN_ROUNDS = 26  # a round takes a small eigenvalue 1.5 times nearer to one: to 3e-5 of the largest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

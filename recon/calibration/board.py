@@ -72,8 +72,7 @@ class Calibration:
     warnings: tuple[str, ...]
 
 
-AS_WELL = 1.02
-"""A model fits as well as another if its rms is at most so many times the other's."""
+AS_WELL = 1.02  # a model fits as well as another if its rms is at most so many times the other's
 
 
 def find_board(gray: U8, board: Board) -> F32 | None:

@@ -44,8 +44,7 @@ SIGMA_TURN_RAD = 0.01
 TURNING_STEPS = 10
 """Towards free turns of the rows: noise alone decides the rest of the way to a weak minimum."""
 
-RAYLEIGH_MEDIAN = 1.1774
-"""Median length of an error whose coordinates have sigma 1."""
+RAYLEIGH_MEDIAN = 1.1774  # median length of an error whose coordinates have sigma 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,18 +29,14 @@ LENS = SelfCalibrationConfig(sigma_focal=0.003, sigma_centre=0.003, sigma_k=0.01
 """How far a lens may be off that is calibrated, or found by the images. Held as it is, its errors
 bend the ground."""
 
-USUAL_S = 0.03
-"""Readout that bounds the turns where none is known: cameras have 0 to 50 ms."""
-
-ROUNDS = 5
-"""In which the readout and the turns settle."""
+USUAL_S = 0.03  # readout that bounds the turns where none is known: cameras have 0 to 50 ms
+ROUNDS = 5  # in which the readout and the turns settle
 
 PATCHES = 25
 """Of an image, whose sightings share an error. Over flat ground a turn that all images share shows
 only in differences far smaller than a pixel, so such errors would decide about it."""
 
-MIN_SIGMAS = 3.0
-"""A readout that differs from none by less is not used."""
+MIN_SIGMAS = 3.0  # a readout that differs from none by less is not used
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,8 +28,7 @@ WIDTH_PX, FEATURES = 1920, 2500
 LIKELY, MIN_ALIKE = 600, 10
 """Number of strongest features compared, and of matches needed, for two images to be alike."""
 
-THRESHOLD_PX = 2.0
-"""Maximum distance to the epipolar line."""
+THRESHOLD_PX = 2.0  # maximum distance to the epipolar line
 
 MIN_MATCHES = 15
 
@@ -59,8 +58,7 @@ def image_of(gray: U8, camera: Camera) -> Image:
     return Image(found, without_distortion(camera, found.uv_px), place)
 
 
-MIN_COMMON = 12
-"""Places in both of two images that tie them."""
+MIN_COMMON = 12  # places in both of two images that tie them
 
 
 def pieces(seen: Sightings, count: int) -> I64:

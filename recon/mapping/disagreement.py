@@ -20,15 +20,9 @@ from recon import se3
 from recon.mapping.voxel_map import sampled, shared
 from recon.types import F32, F64, Bool, DepthMap
 
-NORMAL_MEDIAN = 0.6745
-"""Median of the absolute value of a normal variable of unit sigma."""
-
-
-IMAGES = 32
-"""Number of images that are kept."""
-
-MIN_COMMON = 60
-"""Minimum number of samples that two images share."""
+NORMAL_MEDIAN = 0.6745  # median of the absolute value of a normal variable of unit sigma
+IMAGES = 32  # number of images that are kept
+MIN_COMMON = 60  # minimum number of samples that two images share
 
 NEIGHBOURS_CORRELATION = (0.55, 0.28)
 """Correlation of the errors of an image and of the one before it, and the one before that.

@@ -15,11 +15,8 @@ import numpy as np
 from recon.mapping.voxel_map import sampled, shared
 from recon.types import F32, F64, I64, U8, DepthMap
 
-IMAGES = 64
-"""Number of images that are kept."""
-
-MIN_COMMON = 60
-"""Minimum number of samples in common with earlier images."""
+IMAGES = 64  # number of images that are kept
+MIN_COMMON = 60  # minimum number of samples in common with earlier images
 
 KEPT = 0.95
 """Share of the logarithm of a gain that is kept from image to image. What has one side of all
@@ -32,21 +29,15 @@ UNSEEN = 0.03
 """Smaller changes show in no seam and are left: what looks different from another side is no change
 of exposure."""
 
-SAME_SHARE = 0.02
-"""Samples are of one surface where their depths differ by less than this share."""
+SAME_SHARE = 0.02  # samples are of one surface where their depths differ by less than this share
 
 FITTED, STEPS, HUBER = 2000, 6, 1.5
 """About so many samples are used; steps of the reweighted least squares; residuals of more medians
 count less."""
 
-BLUR_PX = 9
-"""Side of the square that is a sample's colour: places are right to some pixels."""
-
-DARK, BURNT = 5, 245
-"""Beyond these levels a colour says nothing about exposure."""
-
-KNEE = np.float32(224)
-"""Levels that a gain lifts beyond this one approach white: none is burnt."""
+BLUR_PX = 9  # side of the square that is a sample's colour: places are right to some pixels
+DARK, BURNT = 5, 245  # beyond these levels a colour says nothing about exposure
+KNEE = np.float32(224)  # levels that a gain lifts beyond this one approach white: none is burnt
 
 MAX_LOG = float(np.log(3.0))
 

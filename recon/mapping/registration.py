@@ -26,11 +26,8 @@ AREA_SIGMAS, AREA_LAGS = 4.685, 12
 lag."""
 
 
-MIN_PARTNERS = 50
-"""Minimum number of partners; fewer do not count as an overlap."""
-
-GATE_SHARE = 0.05
-"""Residuals above this share of the depth are no partners."""
+MIN_PARTNERS = 50  # minimum number of partners; fewer do not count as an overlap
+GATE_SHARE = 0.05  # residuals above this share of the depth are no partners
 
 EDGE_SHARE = 0.004
 """A 5x5 window that bends by more than this share of its depth holds a depth edge."""
@@ -45,11 +42,8 @@ beyond one of them is rejected: the start is off by less."""
 WEAK_SLOPE = 0.02
 """Rms slope of the ground that a direction needs to be observed: noise tilts normals by less."""
 
-UNKNOWN_SIGMA_M = 10.0
-"""Of directions that are not observed."""
-
-MAX_DISAGREEMENT = 4.0
-"""Chi-square per degree of freedom against the images' motion."""
+UNKNOWN_SIGMA_M = 10.0  # of directions that are not observed
+MAX_DISAGREEMENT = 4.0  # chi-square per degree of freedom against the images' motion
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,7 @@ from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
 from recon.types import F32, F64, Bool, DepthMap, Keyframe, Pose, Verdict
 
-FARTHEST_M = 1e6
-"""Maximum distance from the scan's origin."""
+FARTHEST_M = 1e6  # maximum distance from the scan's origin
 
 
 class KeyframeMap:

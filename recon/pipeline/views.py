@@ -24,11 +24,8 @@ from recon.tracking.keyframe_window import landmark_points, median_depth, step_c
 from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F32, F64, U8
 
-KEPT = 6
-"""Views remembered as partners; those further back see the ground from too far aside."""
-
-MIN_FRAMES_PER_STEP = 6.0
-"""A keyframe may be late by one part in so many."""
+KEPT = 6  # views remembered as partners; those further back see the ground from too far aside
+MIN_FRAMES_PER_STEP = 6.0  # a keyframe may be late by one part in so many
 
 NEAREST_PARTNER, FARTHEST_PARTNER = 0.6, 2.2
 PARTNER_SPAN = FARTHEST_PARTNER - NEAREST_PARTNER
@@ -39,18 +36,14 @@ AHEAD, KNOWN_KEPT, KNOWN_PARTNERS = 4, 12, 2
 """Views to come that a view of a known track waits for, views remembered there, and partners for
 each of ``compute.pairs``: such a track has no drift over wide baselines."""
 
-WIDEST = 0.45
-"""Base to height of such partners, at most."""
-
-TRACKED = 128
-"""Tracked frames whose places are remembered."""
+WIDEST = 0.45  # base to height of such partners, at most
+TRACKED = 128  # tracked frames whose places are remembered
 
 HELD = 5
 """Views that wait at most for the first estimate of a readout that is not stated: all are among
 those kept."""
 
-KNOWN_ROWS = np.zeros((1, 1), np.float32)
-"""No uncertain motion of rows adds to the sigma of depth."""
+KNOWN_ROWS = np.zeros((1, 1), np.float32)  # no uncertain motion of rows adds to the sigma of depth
 
 FIRST_SHARE = 0.3
 """Of a usual step: the first frame that far from a view is the partner of its first depth. Those

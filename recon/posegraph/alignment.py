@@ -48,8 +48,7 @@ WILD = 12.5
 """Beyond this, and beyond twice the median, what a reading pulls falls by the square of its
 residual (redescending, as Hampel's): it is no noise. From a wrong start all residuals are large."""
 
-ODD = 5.0
-"""The same of a fix against those next to it, which noise reaches once in a million times."""
+ODD = 5.0  # the same of a fix against those next to it, which noise reaches once in a million times
 
 SETTLED = 1e-3
 """A step of so many sigmas ends the fit: each is about half as long as the one before."""
@@ -57,14 +56,9 @@ SETTLED = 1e-3
 SETTLED_START = 0.1
 """The same for a fit that only starts another one, or whose residuals give the noise."""
 
-ITERATIONS = 30
-"""Steps of a fit, at most."""
-
-ROUNDS = 4
-"""Times that the noise of altitudes and the tilt by them are found in turn."""
-
-MIN_WALK = 0.02
-"""Sigma that no integrated velocity is better than, m / sqrt(s)."""
+ITERATIONS = 30  # steps of a fit, at most
+ROUNDS = 4  # times that the noise of altitudes and the tilt by them are found in turn
+MIN_WALK = 0.02  # sigma that no integrated velocity is better than, m / sqrt(s)
 
 
 def fit(

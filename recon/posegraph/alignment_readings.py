@@ -30,17 +30,10 @@ KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
 USUAL_RATE_M_S, RATE_S = 0.05, 20.0
 """Sigma of the slow part of a velocity's error, and its time constant."""
 
-MIN_WAY_S = 1e-3
-"""Time that no way by velocity is shorter than."""
-
-UNKNOWNS = 11
-"""Rotation, shift and log scale; an assumed view's mount and the drift of altitudes."""
-
-AXES = (slice(0, 2), slice(2, 3))
-"""Those of a position that err alike: horizontal and vertical."""
-
-TINY = 1e-6
-"""Sigma of what no reading has."""
+MIN_WAY_S = 1e-3  # time that no way by velocity is shorter than
+UNKNOWNS = 11  # rotation, shift and log scale; an assumed view's mount and the drift of altitudes
+AXES = (slice(0, 2), slice(2, 3))  # those of a position that err alike: horizontal and vertical
+TINY = 1e-6  # sigma of what no reading has
 
 
 Heights = tuple[float, float, float]

@@ -26,8 +26,7 @@ from recon.types import F64, PosePrior
 HEIGHT_GATE = 0.05
 """Share of a height by which one exactly below may be off, once its constant is out."""
 
-BLOCK = 20
-"""Keyframes that share one scale and one altitude bias."""
+BLOCK = 20  # keyframes that share one scale and one altitude bias
 
 VELOCITY_S, FASTEST_M_S = 1.0, 100.0
 """A speed is taken over this time at least, as errors of two poses would be most of a shorter step;
@@ -42,20 +41,14 @@ KNOWN_SCALE, UNKNOWN_SCALE = 0.1, 1.0
 """Sigma of the logarithm of a segment's first scale: at least, as its alignment fits one scale to
 a track whose scale drifts; and where no reading measures it."""
 
-SIGMA_SCALE_WALK = 0.003
-"""Sigma of the change of the scale from block to block."""
+SIGMA_SCALE_WALK = 0.003  # sigma of the change of the scale from block to block
 
 BLOCKS_PER_HEIGHT = 2.0
 """Heights above ground of so many blocks count as one: relief is the same under neighbours."""
 
-HUBER_SIGMAS = 1.5
-"""From so many of its residual on a reading loses weight."""
-
-FRAME_DRIFT = 0.003
-"""Share of the path flown by which a track may leave the frame of its segment."""
-
-SIGMA_LOOP_SCALE = 0.002
-"""Of the ratio of the depths at a loop's ends."""
+HUBER_SIGMAS = 1.5  # from so many of its residual on a reading loses weight
+FRAME_DRIFT = 0.003  # share of the path flown by which a track may leave the frame of its segment
+SIGMA_LOOP_SCALE = 0.002  # of the ratio of the depths at a loop's ends
 
 ALTITUDE_SLACK_M = 3.0
 """An altitude further beyond its gate has stepped: pressure by a climb or a gust is less."""

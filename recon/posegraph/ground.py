@@ -14,8 +14,7 @@ from recon.plane import plane_normal
 from recon.posegraph.records import Node
 from recon.types import F64, DepthMap, PosePrior
 
-INDEPENDENT_HEIGHTS = 4.0
-"""Heights of one flight count as so many: they share the ground's relief."""
+INDEPENDENT_HEIGHTS = 4.0  # heights of one flight count as so many: they share the ground's relief
 
 UNMEASURED_HEIGHTS = 1.0
 """Heights above the take-off point, or assumed ones, count as so many: they share one offset."""
@@ -29,11 +28,8 @@ EXACT_HEIGHTS = 16.0
 LEANING_SHARE = 2.0
 """Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
 
-MIN_EXACT = 4
-"""Heights exactly below from which on no others count."""
-
-MIN_SPREAD = 0.005
-"""Share of a height by which readings of one flight may always differ."""
+MIN_EXACT = 4  # heights exactly below from which on no others count
+MIN_SPREAD = 0.005  # share of a height by which readings of one flight may always differ
 
 EDGE_SHARE = 0.03
 """Depths about the point below that differ by more than this share belong to an edge."""
@@ -122,17 +118,13 @@ ASSUMED_TILT_RAD = math.radians(6.0)
 MAX_SLOPE_RAD = math.radians(20.0)
 """Few sites slope by more; a camera held by hand or by a kite line often does."""
 
-LEVEL_SIGMA_RAD = math.radians(10.0)
-"""How far sites that are taken as level slope."""
+LEVEL_SIGMA_RAD = math.radians(10.0)  # how far sites that are taken as level slope
 
 MAX_LEVELLED_SHARE = 0.2
 """Of the views; fewer see a slope, or are placed badly, and the assumed mount levels the flight."""
 
-MIN_POINTS = 30
-"""Landmarks that a plane needs, as single trees lie off it."""
-
-MAX_THICKNESS = 0.2
-"""Spread across a plane over its width; thicker ground has no normal."""
+MIN_POINTS = 30  # landmarks that a plane needs, as single trees lie off it
+MAX_THICKNESS = 0.2  # spread across a plane over its width; thicker ground has no normal
 
 FAR = 3.0
 """Times the median distance from the middle; landmarks beyond are placed badly, and tilt a plane by

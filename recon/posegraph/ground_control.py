@@ -28,8 +28,7 @@ from recon.posegraph.smoother import (
 from recon.table import Rows
 from recon.types import F64, I64, Bool, PosePrior
 
-STEPS = 60
-"""Maximum number of steps of the solution."""
+STEPS = 60  # maximum number of steps of the solution
 
 SIGMA_STEP, SIGMA_STEP_M, SIGMA_TURN_RAD = 0.003, 0.01, 5e-4
 """Sigmas of one motion: as a share of its length, in metres, and of its turn."""
@@ -44,8 +43,7 @@ BREAK_S, SIGMA_BREAK_M, SIGMA_BREAK_RAD = 10.0, 5.0, 0.3
 HELD, HELD_PLACE, HELD_SIGMA = "held", "held place", 1e-5
 """Kinds of factors that hold what is not an unknown; rad and m."""
 
-UNIT = NO_SCALE + 1
-"""Key of the first stretch's scale, in whose unit all motions err."""
+UNIT = NO_SCALE + 1  # key of the first stretch's scale, in whose unit all motions err
 
 MARK = np.dtype(
     [("key", int), ("point", int), ("scale", int), ("ray", float, (3,)), ("depth", float),

@@ -15,11 +15,8 @@ from recon.posegraph.trajectory import Trajectory
 from recon.tracking.sift_features import alike, signature
 from recon.types import F64, U8, DepthMap
 
-WIDTH_PX = 640
-"""Width of the images kept; loops need no finer ones."""
-
-MIN_DEPTH_PX = 120
-"""A depth image at least twice as wide is kept at half its size."""
+WIDTH_PX = 640  # width of the images kept; loops need no finer ones
+MIN_DEPTH_PX = 120  # a depth image at least twice as wide is kept at half its size
 
 MIN_GAP, MIN_OVERLAP = 10, 0.35
 """Keyframes between the two ends of a loop on one chain, and how much of the later view must lie in
@@ -28,18 +25,14 @@ the earlier one."""
 TRIES = 2
 """Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
 
-COMPARED = 20
-"""Keyframes whose look is compared with a new one's, at most: some 4 ms each."""
-
-MIN_ALIKE = 8
-"""Features that two images of one place have in common, of their strongest."""
+COMPARED = 20  # keyframes whose look is compared with a new one's, at most: some 4 ms each
+MIN_ALIKE = 8  # features that two images of one place have in common, of their strongest
 
 PAUSE = 3
 """Keyframes without a search after a loop was taken, as they would only repeat it; fewer where the
 view moves on by :data:`MOVED` of its diagonal."""
 
-MOVED = 0.25
-"""Of the view's diagonal, from which on a loop tells something new."""
+MOVED = 0.25  # of the view's diagonal, from which on a loop tells something new
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,7 @@ DRIFT, SLACK_M, MAX_TURN_RAD = 0.05, 2.0, 0.5
 """A loop off by more than this share of the path between its ends and so many metres, or by such a
 turn, is impossible: vision drifts by less."""
 
-MAX_PENDING = 50
-"""Loops that wait for one that agrees; older ones are forgotten."""
+MAX_PENDING = 50  # loops that wait for one that agrees; older ones are forgotten
 
 
 class PoseGraph:

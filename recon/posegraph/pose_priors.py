@@ -20,14 +20,9 @@ from recon import se3
 from recon.posegraph.records import Node
 from recon.types import F64, Bool, PosePrior, Travel
 
-MIN_FIX_M = 0.005
-"""Sigma that no fix is better than."""
-
-MIN_TURN_RAD = 1e-4
-"""Sigma that no attitude is better than."""
-
-MAX_WORSE = 2.0
-"""A fix whose sigma is so many times that of another spoils their mean."""
+MIN_FIX_M = 0.005  # sigma that no fix is better than
+MIN_TURN_RAD = 1e-4  # sigma that no attitude is better than
+MAX_WORSE = 2.0  # a fix whose sigma is so many times that of another spoils their mean
 
 
 def has_fix(prior: PosePrior) -> bool:
@@ -175,8 +170,7 @@ def averaged(one: tuple[F64, PosePrior], other: tuple[F64, PosePrior], share: fl
     )
 
 
-MAX_GAP_S = 3.0
-"""A longer time without a velocity begins a new run."""
+MAX_GAP_S = 3.0  # a longer time without a velocity begins a new run
 
 
 class VelocityIntegrator:

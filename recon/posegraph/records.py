@@ -67,14 +67,12 @@ class Loop:
         return replace(self, T_a_b=T, covariance=se3.in_units(self.covariance, factor))
 
 
-SIGMA_STEP = 0.002
-"""Sigma of one motion of vision, as a share of its length."""
+SIGMA_STEP = 0.002  # sigma of one motion of vision, as a share of its length
 
 LOOP_WINDOW = 15
 """Keyframes within which two loops support each other: between those, vision is trusted."""
 
-CHI2_LIMIT = 22.5
-"""99.9 % of chi-square with six degrees of freedom."""
+CHI2_LIMIT = 22.5  # 99.9 % of chi-square with six degrees of freedom
 
 
 def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64) -> bool:

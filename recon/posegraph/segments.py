@@ -25,8 +25,7 @@ and once it has settled."""
 MIN_KEYFRAMES = 3
 """Keyframes of a segment before telemetry places it: two leave the turn about their line open."""
 
-SETTLED = 100
-"""Keyframes from which on a segment's similarity changes little."""
+SETTLED = 100  # keyframes from which on a segment's similarity changes little
 
 HEADING_KNOWN_RAD, HEIGHT_KNOWN_M = 1.0, 20.0
 """Sigmas of a heading and of a fix's height below which they place a segment."""

@@ -14,41 +14,30 @@ from scipy.linalg import solveh_banded
 
 from recon.types import F64
 
-MIN_READINGS = 12
-"""Readings from which on their scatter is measured."""
+MIN_READINGS = 12  # readings from which on their scatter is measured
 
 BIAS_TAU_S = FIX_S, ATTITUDE_S, ALTITUDE_S = 60.0, 40.0, 120.0
 """Usual time constants with which a receiver's error wanders, an attitude's and a barometer's."""
 
-TAUS_S = (2.0, 5.0, 10.0, 20.0, 40.0)
-"""Time constants that are tried."""
+TAUS_S = (2.0, 5.0, 10.0, 20.0, 40.0)  # time constants that are tried
 
 TAUS_SEEN = 2.5
 """Time constants that the longest lag must span, so that the variogram is seen to level off."""
 
-SURE_OF_BIAS = 1.4
-"""A bias is accepted when the variogram fits so many times better with it."""
-
-PRECISE_TAU_S = 10.0
-"""Time constant of a receiver's bias with RTK or PPK."""
-
-MIN_BIAS = 0.25
-"""Share of a receiver's claimed sigma by which it always wanders."""
-
-PRECISE_M = 0.3
-"""Fixes of a smaller sigma are RTK's or PPK's."""
+SURE_OF_BIAS = 1.4  # a bias is accepted when the variogram fits so many times better with it
+PRECISE_TAU_S = 10.0  # time constant of a receiver's bias with RTK or PPK
+MIN_BIAS = 0.25  # share of a receiver's claimed sigma by which it always wanders
+PRECISE_M = 0.3  # fixes of a smaller sigma are RTK's or PPK's
 
 LAG_SHARE = 1.0 / 6.0
 """Longest lag as a share of the span: a fit to the readings hides correlations over longer lags."""
 
-LAGS = 12
-"""Bins of the variogram, in equal ratios, as correlation falls off exponentially."""
+LAGS = 12  # bins of the variogram, in equal ratios, as correlation falls off exponentially
 
 CHI_SQUARED_MEDIANS = (0.45493642311957283, 1.3862943611198906, 2.3659738843753377)
 """Of one to three degrees of freedom."""
 
-MAX_PAIRED = 400
-"""Readings that are compared with each other; of more, every n-th."""
+MAX_PAIRED = 400  # readings that are compared with each other; of more, every n-th
 
 
 MIN_FRESH = 1e-9

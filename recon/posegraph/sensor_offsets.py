@@ -21,14 +21,9 @@ from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
 from recon.similarity import lever
 from recon.types import F64, PosePrior
 
-SIGMA_RAD = np.radians(2.0)
-"""How well a camera is aligned before anything is known."""
-
-BOUND_RAD = np.radians(5.0)
-"""A larger angle is not a boresight but another fault."""
-
-MIN_ATTITUDES = 8
-"""Minimum number of attitudes of a stretch."""
+SIGMA_RAD = np.radians(2.0)  # how well a camera is aligned before anything is known
+BOUND_RAD = np.radians(5.0)  # a larger angle is not a boresight but another fault
+MIN_ATTITUDES = 8  # minimum number of attitudes of a stretch
 
 WILD = 5.0
 """Median of the whitened residuals beyond which attitudes and images do not belong together."""
@@ -36,8 +31,7 @@ WILD = 5.0
 SURE = 9.0
 """Squared sigmas by which a boresight must differ from none before attitudes are corrected."""
 
-ROUNDS = 6
-"""Gauss-Newton steps, each with new robust weights."""
+ROUNDS = 6  # Gauss-Newton steps, each with new robust weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,8 +150,7 @@ def boresight(
     return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))))
 
 
-MIN_INTERVALS = 3
-"""Minimum number of intervals between keyframes with fixes."""
+MIN_INTERVALS = 3  # minimum number of intervals between keyframes with fixes
 
 STEADY_SHARE = 0.1
 """Share of the claimed sigma that always stays: one flight cannot show all errors of a receiver."""
@@ -165,8 +158,7 @@ STEADY_SHARE = 0.1
 OFF_SIGMAS = 4.0
 """Intervals further from the median than so many of the scatter and the sigma do not count."""
 
-BY_CHANCE = 2.6
-"""The variance of four means exceeds the true one by more in one case of twenty."""
+BY_CHANCE = 2.6  # the variance of four means exceeds the true one by more in one case of twenty
 
 WILD_STEPS = 36.0
 """Squared steps from fix to fix beyond so many of their median are jumps, not scatter."""
@@ -225,8 +217,7 @@ def _wandered(above: F64, fixes: F64, white: float) -> float:
     return apart - scatter if apart > BY_CHANCE * scatter else 0.0
 
 
-PRIOR_SIGMA = 0.1
-"""rad and share; how far fixes may be turned and stretched against the frame."""
+PRIOR_SIGMA = 0.1  # rad and share; how far fixes may be turned and stretched against the frame
 
 GATE_SIGMAS = 5.0
 """Beyond so many sigmas from the prediction a reading is left out, as noise alone reaches that once

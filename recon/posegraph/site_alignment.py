@@ -17,17 +17,13 @@ from recon import se3
 from recon.similarity import Similarity, lever
 from recon.types import F64, Bool
 
-STEPS = 12
-"""Gauss-Newton steps, each with new robust weights."""
-
-CAUCHY_SIGMAS = 2.0
-"""Sigmas of a tie's error, per component, beyond which it loses weight."""
+STEPS = 12  # Gauss-Newton steps, each with new robust weights
+CAUCHY_SIGMAS = 2.0  # sigmas of a tie's error, per component, beyond which it loses weight
 
 ALIKE = 5.0
 """Sigmas of place that differ less than so many times may be of receivers that are equally good."""
 
-UNKNOWNS = 7
-"""Unknowns of a scan: rotation vector, shift of its centre, logarithm of the scale."""
+UNKNOWNS = 7  # unknowns of a scan: rotation vector, shift of its centre, logarithm of the scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,17 +23,10 @@ from recon.types import F64, I64
 MIN_WAIT, POSES_PER_WAIT = 2, 100
 """Poses that wait between two updates, and poses held for each further one."""
 
-STEPS, MANY_STEPS = 1, 10
-"""Maximum number of steps of an update, and where many poses may move far."""
-
-SMALL_STEP = 1e-3
-"""rad, m and log scale; none follows a step that is smaller."""
-
-SHARES = 0.5 ** np.arange(8)
-"""Shares of a step, tried in turn until the cost falls."""
-
-NO_SCALE = 0
-"""Key of a scale that is held at 1."""
+STEPS, MANY_STEPS = 1, 10  # maximum number of steps of an update, and where many poses may move far
+SMALL_STEP = 1e-3  # rad, m and log scale; none follows a step that is smaller
+SHARES = 0.5 ** np.arange(8)  # shares of a step, tried in turn until the cost falls
+NO_SCALE = 0  # key of a scale that is held at 1
 
 MOTION = np.dtype(
     [("a", int), ("b", int), ("scale", int), ("unit", int), ("R", float, (3, 3)),

@@ -39,11 +39,8 @@ MIN_MATCHES, MIN_INLIER_SHARE, GATE_SIGMAS = 14, 0.6, 3.0
 """Places that both surfaces have, and the share of them that one motion must bring together to so
 many sigmas."""
 
-PIXEL_SIGMA = 0.4
-"""Sigma of a match, px."""
-
-MIN_SPREAD = 0.02
-"""Of the matches across their narrow side, of their distance."""
+PIXEL_SIGMA = 0.4  # sigma of a match, px
+MIN_SPREAD = 0.02  # of the matches across their narrow side, of their distance
 
 MATCHING = matching.MatchingConfig(grid=50, ambiguity=0.9, max_zssd=0.6, max_return_px=0.7)
 
@@ -128,8 +125,7 @@ def _covariance(T: F64, here: F64, there: F64, sigma: F64, inside: Bool) -> F64:
     return np.asarray(variance * np.linalg.inv(H) + floor)
 
 
-MIN_NEIGHBOURS = 5
-"""Number of a pixel's eight neighbours that must be known for it to be filled."""
+MIN_NEIGHBOURS = 5  # number of a pixel's eight neighbours that must be known for it to be filled
 
 
 def filled(own: Keyframe, others: Sequence[Keyframe]) -> Keyframe:

@@ -26,8 +26,7 @@ from recon.types import F64
 NEWEST_SHARE = 0.25
 """Share of the newest nodes, which always stay: the next motions and loops start from them."""
 
-GONE_SHARE = 0.25
-"""Share of the nodes removed at once, so that rebuilding is rare."""
+GONE_SHARE = 0.25  # share of the nodes removed at once, so that rebuilding is rare
 
 
 def thin(

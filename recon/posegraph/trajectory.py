@@ -21,8 +21,7 @@ AT_ONCE = 600
 """Corrections published at once in flight, at most: to build them takes some ms, in which tracking
 may wait. The rest follows with the next keyframe."""
 
-SIGMA_SHARE = 0.01
-"""A sigma that differs by more is published again at the end."""
+SIGMA_SHARE = 0.01  # a sigma that differs by more is published again at the end
 
 SETTLED_M = 1e-6
 """At the end, every keyframe that moved by more is published: rounding errors are smaller."""

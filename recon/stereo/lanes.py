@@ -15,12 +15,8 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils
 
-LANES = 32
-"""Cells that are updated together; LLVM spreads them over the registers that there are."""
-
-
-PARTS = 2
-"""Parts of them whose 16-bit envelopes the registers of AVX2 hold at once."""
+LANES = 32  # cells that are updated together; LLVM spreads them over the registers that there are
+PARTS = 2  # parts of them whose 16-bit envelopes the registers of AVX2 hold at once
 
 
 def cells_of(width: int) -> int:

@@ -16,8 +16,7 @@ from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, Camera, PosePrior
 
-KEPT = 8
-"""Keyframes that are remembered."""
+KEPT = 8  # keyframes that are remembered
 
 
 class AdjustedTrack:

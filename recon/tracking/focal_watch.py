@@ -19,8 +19,7 @@ from recon.types import F64, I64
 HUBER_PX = 1.0
 """Longer errors lose weight: corners err by some tenths of a pixel, mismatches by more."""
 
-CELLS = 4
-"""Rows and columns of cells of the landmarks."""
+CELLS = 4  # rows and columns of cells of the landmarks
 
 
 class FocalWatch:

@@ -18,8 +18,7 @@ NOWHERE, NO_SPREAD = np.full((4, 4), np.nan), np.zeros((6, 6))
 UNKNOWN = PosePrior()
 
 
-TWO_ONLY = "seen by two views only"
-"""Reason why a view is refused: nothing confirms its one pair."""
+TWO_ONLY = "seen by two views only"  # reason why a view is refused: nothing confirms its one pair
 
 CONTRADICTED = "pairs contradict each other"
 """Another: its pairs, or those of most views before it, do not agree on a surface."""

@@ -52,18 +52,14 @@ MAX_TILT_ERROR_RAD = 0.35
 """Vision against attitude, 20 degrees: since the keyframe before no gimbal or compass in order errs
 by more, so it is a false solution."""
 
-LOOSE_PX = 6.0
-"""Gate of a second try: a rolling shutter bends images that much."""
-
-LOW_RATE_GAP_S = 0.7
-"""Frames further apart are stills: no motion model holds."""
+LOOSE_PX = 6.0  # gate of a second try: a rolling shutter bends images that much
+LOW_RATE_GAP_S = 0.7  # frames further apart are stills: no motion model holds
 
 RECALLED = 4
 """Newest keyframes that a frame is compared with by features: of stills with 75 % overlap no
 more show the same ground."""
 
-CLEAR_SHARE = 0.6
-"""Share of the corners searched: if so many are found, no other start is tried."""
+CLEAR_SHARE = 0.6  # share of the corners searched: if so many are found, no other start is tried
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,8 +14,7 @@ import numpy as np
 
 from recon.types import F64, U8
 
-LAGS = 64
-"""Longest streak that is looked for, in px."""
+LAGS = 64  # longest streak that is looked for, in px
 
 SIDE_SHARE = 0.7
 """Side of the square in the middle of the image, over the image's shorter side: fits turned."""
@@ -32,8 +31,7 @@ SLOW_PX = 5.0
 """A median streak beyond it is a shutter too slow. Fields and roads have a direction of their own:
 sharp images show 1 px typically, and up to 5."""
 
-KEPT, MIN_KNOWN = 15, 5
-"""Keyframes that the exposure follows from, at most and at least."""
+KEPT, MIN_KNOWN = 15, 5  # keyframes that the exposure follows from, at most and at least
 
 
 def streak_px(gray: U8, direction: F64) -> float:

@@ -22,38 +22,20 @@ KEYFRAMES, FIRST_KEYFRAMES = 5, 3
 """Keyframes of a window, and until the readout is sure, as what is not known of it bends long ones;
 the next window begins at its last one."""
 
-COARSE_S = 1e-3 * np.arange(-40.0, 41.0, 10.0)
-"""Readouts that are tried while none is sure."""
-
-STEP_S = 5e-3
-"""Spacing of the readouts tried around the one in use, once it is sure."""
-
-NEAR_S = 1e-3
-"""A readout further from the one in use starts the search again."""
-
-MAX_READOUT_S = 0.05
-"""Longest readout tried: an image at 20 a second is read by then."""
-
-MIN_SIGMAS = 5.0
-"""A readout is taken over when it differs from none by so many sigmas."""
-
-FLOOR_S = 1e-4
-"""Sigma of the row motion's own errors."""
-
-BENT = 0.1
-"""Of the way from the readout in use, by which the rows' motion was bent: a sigma."""
-
-MIN_WINDOWS = 2
-"""Fewer make nothing sure."""
-
-GLOBAL_S = 5e-4
-"""A readout and a sigma below it show a global shutter."""
+COARSE_S = 1e-3 * np.arange(-40.0, 41.0, 10.0)  # readouts that are tried while none is sure
+STEP_S = 5e-3  # spacing of the readouts tried around the one in use, once it is sure
+NEAR_S = 1e-3  # a readout further from the one in use starts the search again
+MAX_READOUT_S = 0.05  # longest readout tried: an image at 20 a second is read by then
+MIN_SIGMAS = 5.0  # a readout is taken over when it differs from none by so many sigmas
+FLOOR_S = 1e-4  # sigma of the row motion's own errors
+BENT = 0.1  # of the way from the readout in use, by which the rows' motion was bent: a sigma
+MIN_WINDOWS = 2  # fewer make nothing sure
+GLOBAL_S = 5e-4  # a readout and a sigma below it show a global shutter
 
 HUBER_PX = 1.0
 """Longer errors lose weight: corners err by some tenths of a pixel, mismatches by more."""
 
-USUAL_S = 0.02
-"""Sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms."""
+USUAL_S = 0.02  # sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms
 
 
 Cost = Callable[["list[Frame]", float, F64], tuple[float, int]]

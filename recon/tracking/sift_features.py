@@ -16,17 +16,13 @@ import numpy as np
 from recon.tracking import robust_geometry
 from recon.types import F32, F64, U8
 
-WIDTH_PX = 480
-"""Width of the image in which features are detected: 0.1 s on one core."""
-
-MOST = 1000
-"""Features of an image."""
+WIDTH_PX = 480  # width of the image in which features are detected: 0.1 s on one core
+MOST = 1000  # features of an image
 
 FINE_WIDTH_PX, FINE_MOST = 960, 3000
 """For stills that share too few of those: treetops look alike, or different, in a small image."""
 
-RATIO = 0.8
-"""Distance to the best descriptor over that to the second best, at most."""
+RATIO = 0.8  # distance to the best descriptor over that to the second best, at most
 
 GATE_SHARE = 0.015
 """Share of the image's width by which a match may miss the common homography: relief."""

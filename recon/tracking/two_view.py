@@ -18,8 +18,7 @@ from recon.plane import plane_normal
 from recon.tracking import bundle, robust_geometry
 from recon.types import F64, Bool
 
-MAX_ERROR_PX = 1.5
-"""Error of a match that a motion explains, at most: some sigmas of two corners."""
+MAX_ERROR_PX = 1.5  # error of a match that a motion explains, at most: some sigmas of two corners
 
 MIN_PARALLAX_RAD, MIN_INLIERS = 2e-3, 20
 """Between the rays of a point, a pixel at a focal length of 500 px; and points that give a motion,

@@ -21,8 +21,7 @@ from service.flight.reports import GraphWatch
 from service.progress import Stopwatch
 from service.stream.outbox import FIRST_BYTES_S
 
-MAX_WAITING = 3
-"""Views that wait for reconstruction."""
+MAX_WAITING = 3  # views that wait for reconstruction
 
 
 def counts(view: StereoView) -> bool:

@@ -17,17 +17,10 @@ from recon.types import F64
 from service.scans.trust import scales_differ
 from service.stream.records import pack_covariance, pack_motion
 
-LEAST = 5
-"""Number of left-out readings of one kind that is reported."""
-
-SIGMAS, MIN_SHARE = 3.0, 0.03
-"""Two scales disagree when they are further apart than both of these."""
-
-LOOK_GROWTH = 1.2
-"""The track is examined again when its keyframes have grown by this share."""
-
-MIN_FIXES = 10
-"""Fixes before the track is held against them."""
+LEAST = 5  # number of left-out readings of one kind that is reported
+SIGMAS, MIN_SHARE = 3.0, 0.03  # two scales disagree when they are further apart than both of these
+LOOK_GROWTH = 1.2  # the track is examined again when its keyframes have grown by this share
+MIN_FIXES = 10  # fixes before the track is held against them
 
 LEFT_OUT = {
     "position off": "positions far from the track were left out: does GNSS jump?",
@@ -111,8 +104,7 @@ def _off_in_sigmas(rows: F64 | None) -> float:
     return 1.4826 * float(np.median(np.abs(rows)))
 
 
-MAX_LOOPS = 300
-"""Loops that a summary carries with their motions; of more, an even sample."""
+MAX_LOOPS = 300  # loops that a summary carries with their motions; of more, an even sample
 
 
 def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:

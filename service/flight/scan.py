@@ -44,8 +44,7 @@ from service.version import software
 
 log = logging.getLogger(__name__)
 
-TIME_STEP_NS = 100_000
-"""Frame times are rounded to this; no camera's clock is finer."""
+TIME_STEP_NS = 100_000  # frame times are rounded to this; no camera's clock is finer
 
 MIN_FOCAL_OFF, FOCAL_OFF_SIGMAS = 0.01, 4.0
 """A focal length by the images that differs by both is another one than the camera model's."""
