@@ -46,10 +46,8 @@ def rotation_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> F64:
 
 
 def rpy_from_rotation(R: F64) -> tuple[float, float, float]:
-    """(roll, pitch, yaw) in rad of R_parent_child, the inverse of :func:`rotation_from_rpy`.
-
-    At pitch = +-90 degrees roll is set to zero and yaw carries the whole turn.
-    """
+    """(roll, pitch, yaw) in rad of R_parent_child, the inverse of :func:`rotation_from_rpy`. At
+    pitch = +-90 degrees roll is set to zero and yaw carries the whole turn."""
     sp = float(np.clip(-R[2, 0], -1.0, 1.0))
     pitch = float(np.arcsin(sp))
     if abs(sp) > 1.0 - 1e-9:

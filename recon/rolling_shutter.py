@@ -48,10 +48,8 @@ class RowClock:
     """When a camera with a rolling shutter exposes what it sees."""
 
     def __init__(self, camera: Camera) -> None:
-        """``camera`` is the one with distortion, at any size of its images.
-
-        ``readout_s`` may be set; it is negative against the shutter's direction.
-        """
+        """``camera`` is the one with distortion, at any size of its images. ``readout_s`` may be
+        set; it is negative against the shutter's direction."""
         axis, sign = camera.shutter.axis, camera.shutter.sign
         self.readout_s = camera.shutter.readout_s
         self._sideways = axis == 0
@@ -199,11 +197,8 @@ class RowTrack:
     """The motion of each frame's rows, from its neighbours' poses in the odometry."""
 
     def __init__(self, camera: Camera, is_sought: bool = False) -> None:
-        """``camera`` is the one with distortion, at any size of its images.
-
-        ``is_sought``: its readout may yet be found. The ``clock`` of all frames is None for a
-        global shutter.
-        """
+        """``camera`` is the one with distortion, at any size of its images. ``is_sought``: its
+        readout may yet be found. The ``clock`` of all frames is None for a global shutter."""
         self.clock = RowClock(camera) if camera.shutter.readout_s or is_sought else None
         self._frames: deque[FrameRows] = deque(maxlen=32)
         self._offs: deque[F64] = deque(maxlen=8)  # of settled frames
@@ -324,10 +319,8 @@ def _by_telemetry(frame: FrameRows, clock: RowClock) -> Rows:
 
 
 def _with_telemetry(prior: PosePrior, rows: Rows) -> Rows:
-    """Motion by neighbours and by telemetry's turn, where there is one, each by its weight.
-
-    The velocity stays: few samples make the covariance, too few for the correlation of both.
-    """
+    """Motion by neighbours and by telemetry's turn, where there is one, each by its weight. The
+    velocity stays: few samples make the covariance, too few for the correlation of both."""
     if prior.turn_rad_s is None:
         return rows
     P, rate, spread = rows.covariance[:3, :3], rows.rate.copy(), np.zeros((6, 6))

@@ -51,10 +51,8 @@ def turn_shares(
 
 
 def _shifts(rows: Rows, points: F64, ray: F64, inverse_depth: F64) -> F64:
-    """(N, 2, 6) by which rays (N, 3) with z = 1 shift per unit of an error of the rows' rate.
-
-    The pose follows that error as far as the ``points`` (M, 3) by which it is found allow.
-    """
+    """(N, 2, 6) by which rays (N, 3) with z = 1 shift per unit of an error of the rows' rate. The
+    pose follows that error as far as the ``points`` (M, 3) by which it is found allow."""
     seen = points[points[:, 2] > 0]
     at = seen / seen[:, 2:]
     J, t = _by_twist(at, 1.0 / seen[:, 2]), rows.clock.seconds(at)

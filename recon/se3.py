@@ -129,11 +129,8 @@ def project_to_so3(T: F64) -> F64:
 
 
 def nearest_rotation(M: F64) -> F64:
-    """(3, 3) rotation R that makes trace(R^T M) largest.
-
-    With the sum of b a^T over pairs of vectors for M it takes each a closest to its b (Kabsch 1976,
-    doi:10.1107/S0567739476001873).
-    """
+    """(3, 3) rotation R that makes trace(R^T M) largest. With the sum of b a^T over pairs of
+    vectors for M it takes each a closest to its b (Kabsch 1976, doi:10.1107/S0567739476001873)."""
     U, _, Vt = np.linalg.svd(M)
     return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
 
@@ -190,10 +187,8 @@ def transform(T: F64, points: F64) -> F64:
 
 
 def rotation_from_quaternion(q_wxyz: F64) -> F64:
-    """(3, 3) rotation of the quaternion (w, x, y, z), normalised first.
-
-    Raises ValueError when the quaternion has no length or is not finite.
-    """
+    """(3, 3) rotation of the quaternion (w, x, y, z), normalised first. Raises ValueError when the
+    quaternion has no length or is not finite."""
     n = float(np.linalg.norm(q_wxyz))
     if not np.isfinite(n) or n < 1e-9:
         raise ValueError(f"quaternion has no direction: {q_wxyz}")
@@ -245,10 +240,8 @@ def each_quaternion(R: F64) -> F64:
 
 
 def disagreement(T_a: F64, covariance_a: F64, T_b: F64, covariance_b: F64) -> float:
-    """Chi-square per degree of freedom of the difference of two estimates of one motion.
-
-    Both covariances are of left perturbations in the same frame.
-    """
+    """Chi-square per degree of freedom of the difference of two estimates of one motion. Both
+    covariances are of left perturbations in the same frame."""
     difference = log(T_b @ inverse(T_a))
     return float(difference @ np.linalg.solve(covariance_a + covariance_b, difference)) / 6.0
 

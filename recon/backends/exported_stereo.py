@@ -28,11 +28,8 @@ OPSET = 17
 def export_stereo(
     file: BinaryIO, size: tuple[int, int], labels: int, config: BeliefPropagationConfig
 ) -> None:
-    """Write an ONNX model into ``file``.
-
-    Gray levels ``left`` and ``right`` (1, 1, h, w) float32, 0 to 255, to ``disparity``
-    (1, 1, h, w) px, NaN where the partner is outside the right image.
-    """
+    """Write an ONNX model into ``file``. Gray levels ``left`` and ``right`` (1, 1, h, w) float32, 0
+    to 255, to ``disparity`` (1, 1, h, w) px, NaN where the partner is outside the right image."""
     model = BeliefPropagation(size, labels, config)
     images = torch.zeros((2, 1, 1, *size))
     with warnings.catch_warnings(), torch.inference_mode():

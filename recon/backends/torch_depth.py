@@ -56,9 +56,7 @@ class DensePath:
         self, pairs: Sequence[StereoPair], K: F64, size_px: tuple[int, int], T_world_camera: F64
     ) -> DepthMap:
         """The fused depth on the keyframe's grid of ``size_px`` (w, h) with intrinsics ``K``.
-
-        Raises ValueError without any pair.
-        """
+        Raises ValueError without any pair."""
         if not pairs:
             raise ValueError("no stereo pair to fuse")
         with torch.inference_mode():
@@ -109,10 +107,8 @@ def pair_depth(
     true: Tensor, geometry: Tensor, *, labels: int, levels: int, size_px: tuple[int, int],
     stages: DenseStages,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """One pair to depth and sigma (h, w) on the keyframe's grid, with room for ``labels``.
-
-    ``true`` (5,) is h, w of the pair, H, W of the guide and the number of labels.
-    """
+    """One pair to depth and sigma (h, w) on the keyframe's grid, with room for ``labels``. ``true``
+    (5,) is h, w of the pair, H, W of the guide and the number of labels."""
     own = torch.stack([true[0], true[1], true[4]])
     px, confidence = stereo(left, right, labels, levels, own, stages.matching)
     px, confidence = drop_unreliable(left, px, confidence, own, stages.matching)
@@ -174,10 +170,8 @@ def device_inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:
 def upsampled(
     px: Tensor, confidence: Tensor, guide: Tensor, true: Tensor, config: UpsamplingConfig
 ) -> tuple[Tensor, Tensor]:
-    """From (h, w) to the size of the guide (H, W, 3) in gray levels; Eq. 2.
-
-    ``true`` (4,) is h, w, H, W.
-    """
+    """From (h, w) to the size of the guide (H, W, 3) in gray levels; Eq. 2. ``true`` (4,) is h, w,
+    H, W."""
     taps = averaged(guide, (px.shape[0], px.shape[1]), true)
     trust = torch.where(px == px, confidence.clamp(min=MIN_CONFIDENCE), 0.0)
     value = torch.where(px == px, px, 0.0) * trust

@@ -637,10 +637,8 @@ LOG2_E = 1 / math.log(2)
 def bilateral(
     layers: Tensor, guide: Tensor, true: Tensor, config: UpsamplingConfig
 ) -> tuple[Tensor, Tensor]:
-    """Labels and confidence (H, W) of a guide (H, W, 3); Eq. 2, all sums in registers.
-
-    ``layers`` (5, h, w) are what a tap brings: three colours, trust, trust times label.
-    """
+    """Labels and confidence (H, W) of a guide (H, W, 3); Eq. 2, all sums in registers. ``layers``
+    (5, h, w) are what a tap brings: three colours, trust, trust times label."""
     _, h, w = layers.shape
     height, width, _ = guide.shape
     tonal = math.sqrt(0.5 * LOG2_E) / config.range_sigma
@@ -709,10 +707,8 @@ def bilateral_kernel(
 
 
 def averaged(guide: Tensor, room: tuple[int, int], true: Tensor) -> Tensor:
-    """(h, w, 3) float32 means of the guide (H, W, 3) over each tap, in whole levels.
-
-    As :func:`recon.stereo.upsampling.guide_at_taps`, where halves may round the other way.
-    """
+    """(h, w, 3) float32 means of the guide (H, W, 3) over each tap, in whole levels. As
+    :func:`recon.stereo.upsampling.guide_at_taps`, where halves may round the other way."""
     H, W, _ = guide.shape
     out = torch.empty((*room, 3), device=guide.device)
     averaged_kernel[(blocks(room[0] * room[1], PIXELS),)](guide, true, out, H, W, *room, PIXELS)

@@ -110,9 +110,7 @@ def calibrate(
     config: CalibrationConfig | None = None,
 ) -> Calibration | None:
     """The camera of ``size_px`` (W, H) that took the views, or None when it cannot be fitted.
-
-    Raises ValueError for fewer than four views.
-    """
+    Raises ValueError for fewer than four views."""
     config = config or CalibrationConfig()
     if len(views) < MIN_VIEWS:
         raise ValueError(f"{len(views)} views of the board are too few; at least {MIN_VIEWS}")

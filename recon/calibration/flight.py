@@ -189,9 +189,7 @@ def free_rows(count: int) -> RowMotion:
 
 def jackknife(problem: Problem, iterations: int = 40) -> float:
     """Relative sigma of the focal length by leaving out one part of the flight after another.
-
-    ``problem`` holds the adjusted state. Tukey 1958, with :data:`PARTS` runs of views.
-    """
+    ``problem`` holds the adjusted state. Tukey 1958, with :data:`PARTS` runs of views."""
     seen, focal = problem.seen, []
     for part in np.array_split(np.unique(seen.view), PARTS):
         rest = shared(seen, ~np.isin(seen.view, part))

@@ -218,9 +218,7 @@ def dispersion(problem: Problem) -> float:
 
 def step_covariances(problem: Problem) -> F64:
     """(N, 6, 6) of the motion from the pose before to each, left perturbation of T_here_before.
-
-    ``problem`` holds the adjusted state. Zero for the first pose.
-    """
+    ``problem`` holds the adjusted state. Zero for the first pose."""
     bundle = _Bundle(problem)
     T, V = bundle.start.T, bundle._unknowns
     eq, out = bundle._equations(bundle.start, 0.0), np.zeros((len(T), 6, 6))
@@ -366,10 +364,8 @@ class _Bundle:
         return replace(s, X=X)
 
     def _moved(self, s: _State, eq: _Equations, dk: F64, dc: F64, bp: F64) -> _State:
-        """The state after the camera's step ``dk`` (8,); poses and points follow it.
-
-        ``dc`` (V N,) and ``bp`` (P, 3) are their own step and right-hand sides.
-        """
+        """The state after the camera's step ``dk`` (8,); poses and points follow it. ``dc`` (V N,)
+        and ``bp`` (P, 3) are their own step and right-hand sides."""
         dc = (dc - eq.Z @ dk).reshape(len(s.T), -1)
         bp = bp - np.einsum("pkc,k->pc", eq.Wk, dk)
         carried = np.einsum("mac,ma->mc", eq.W, dc[self._view])

@@ -132,9 +132,7 @@ def joined(
 
 def sharpened(pyramid: Callable[[int], Pyramid], camera: Camera, seen: Sightings) -> Sightings:
     """Sightings at the places where the patch about each landmark's middle sighting fits best.
-
-    ``pyramid`` gives a view without distortion. A sighting whose patch is not found stays.
-    """
+    ``pyramid`` gives a view without distortion. A sighting whose patch is not found stays."""
     flat = without_distortion(camera, seen.uv_px)
     middle = _middles(seen)
     reference = middle[np.searchsorted(seen.landmark[middle], seen.landmark)]

@@ -178,9 +178,7 @@ def conclude(
     problem: Problem, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
 ) -> Registration:
     """The registration after a last step from ``T`` (4, 4), for a search made elsewhere.
-
-    ``available`` counts the source's surface elements.
-    """
+    ``available`` counts the source's surface elements."""
     return _judged(problem, problem.step() @ T, T_start, available, iterations + 1, config)
 
 

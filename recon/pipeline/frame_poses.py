@@ -66,10 +66,8 @@ class FramePoses:
         return pose
 
     def _fallback(self, frame: Frame) -> Pose:
-        """A frame at its fix, or as far from the last one as the odometry has it.
-
-        Heading and scale of the odometry are not known: the sigma grows by the way.
-        """
+        """A frame at its fix, or as far from the last one as the odometry has it. Heading and scale
+        of the odometry are not known: the sigma grows by the way."""
         at_m, prior = frame.T_odom_camera[:3, 3], frame.prior
         fix, sigma = prior.position_m, prior.sigma_position_m
         if fix is not None and sigma is not None:
@@ -84,11 +82,8 @@ class FramePoses:
         return segment in self._fallbacks and "gnss" in self._fallbacks[segment][3]
 
     def pose(self, frame: Frame, fallback: Pose) -> Pose:
-        """A frame in the world, carried by the view at or before it where it can.
-
-        A segment too short to be aligned has no scale and no heading: its frames stay at their
-        fixes.
-        """
+        """A frame in the world, carried by the view at or before it where it can. A segment too
+        short to be aligned has no scale and no heading: its frames stay at their fixes."""
         view = self._view_of(frame)
         if view is None:
             return fallback

@@ -140,10 +140,8 @@ class KeyframeMap:
 
 
 class SurfaceMap:
-    """Compares each view with the surface known before, and remembers it.
-
-    :meth:`clear` may be called from another thread.
-    """
+    """Compares each view with the surface known before, and remembers it. :meth:`clear` may be
+    called from another thread."""
 
     def __init__(
         self,

@@ -110,8 +110,7 @@ Reconstruct = Callable[[StereoView], Callable[[], Reconstructed]]
 """Work on a view: what it returns is the rest of it, which may go on while work on the next view
 begins, on another thread. Both are in the order of the views."""
 
-COARSER, FIRST_BASE_TO_HEIGHT = 2, 0.02
-"""Images of a first depth are smaller by this factor, and its baseline may be shorter."""
+COARSER, FIRST_BASE_TO_HEIGHT = 2, 0.02  # a first depth's images are smaller, its baseline shorter
 
 
 class Worker(Protocol):
@@ -249,10 +248,8 @@ class Mapper:
         return (*self._finished(), FramePosed(skipped))
 
     def track(self, frame: Frame) -> tuple[Event, ...]:
-        """One frame: where the camera is, and which views have their partners by now.
-
-        Raises ValueError when the image is not of the camera model's size.
-        """
+        """One frame: where the camera is, and which views have their partners by now. Raises
+        ValueError when the image is not of the camera model's size."""
         undistorted = self.undistort(frame)  # section 2.1
         *late, tracked = self.locate(undistorted)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
         placed = [self._posed(still, self.views.take(still)) for still in late]
@@ -421,10 +418,8 @@ class Mapper:
     # ---- results -----------------------------------------------------------------------
 
     def cloud(self, voxel_m: float | None = None) -> PointCloud:
-        """All keyframes fused, in voxels as fine as the images unless ``voxel_m`` is given.
-
-        Raises ValueError for a mapper that does not keep its cloud.
-        """
+        """All keyframes fused, in voxels as fine as the images unless ``voxel_m`` is given. Raises
+        ValueError for a mapper that does not keep its cloud."""
         if self._kept is None:
             raise ValueError("this mapper was made with keeps_cloud=False")
         out = [*self.keyframes.apart(), *self.keyframes.false()]

@@ -46,8 +46,7 @@ def untimed(stage: str) -> AbstractContextManager[object]:
     return nullcontext()
 
 
-MAX_TRACKING_WIDTH_PX = 1280
-"""Wider images are made smaller for tracking, whose time grows with their area."""
+MAX_TRACKING_WIDTH_PX = 1280  # wider images are made smaller: tracking's time grows with their area
 
 
 def check_image(image: U8, size_px: tuple[int, int]) -> None:
@@ -262,10 +261,8 @@ class PlausibleDepth:
 def keyframe_of(
     view: StereoView, depth: DepthMap, bgr: U8, sigma_m: F32, fresh: Bool, pose: Pose
 ) -> Keyframe:
-    """The pipeline's output: metric depth in colour, its pose, and the new part of it.
-
-    ``depth`` and ``sigma_m`` (h, w) are in units of the odometry.
-    """
+    """The pipeline's output: metric depth in colour, its pose, and the new part of it. ``depth``
+    and ``sigma_m`` (h, w) are in units of the odometry."""
     metric = replace(depth, sigma_m=sigma_m).scaled(pose.scale, pose.T_world_camera)
     return Keyframe(view.seq, view.frame.time_ns, metric, bgr, pose, fresh)
 

@@ -38,11 +38,7 @@ each of ``compute.pairs``: such a track has no drift over wide baselines."""
 
 WIDEST = 0.45  # base to height of such partners, at most
 TRACKED = 128  # tracked frames whose places are remembered
-
-HELD = 5
-"""Views that wait at most for the first estimate of a readout that is not stated: all are among
-those kept."""
-
+HELD = 5  # views that wait, at most, for the first estimate of an unstated readout: all are kept
 KNOWN_ROWS = np.zeros((1, 1), np.float32)  # no uncertain motion of rows adds to the sigma of depth
 
 FIRST_SHARE = 0.3
@@ -353,10 +349,8 @@ class VirtualStereoCamera:
         )
 
     def _rows_share(self, view: Frame, partners: list[Frame], points: F64) -> F32:
-        """(n, m) sigma of depth over depth by what is not known of readout and turns.
-
-        ``points`` (N, 3) of the view's camera are the ground.
-        """
+        """(n, m) sigma of depth over depth by what is not known of readout and turns. ``points``
+        (N, 3) of the view's camera are the ground."""
         rows = view.row_motion.rows
         pairs = [
             (partner.row_motion.rows, se3.inverse(partner.T_odom_camera) @ view.T_odom_camera)

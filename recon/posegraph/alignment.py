@@ -49,13 +49,8 @@ WILD = 12.5
 residual (redescending, as Hampel's): it is no noise. From a wrong start all residuals are large."""
 
 ODD = 5.0  # the same of a fix against those next to it, which noise reaches once in a million times
-
-SETTLED = 1e-3
-"""A step of so many sigmas ends the fit: each is about half as long as the one before."""
-
-SETTLED_START = 0.1
-"""The same for a fit that only starts another one, or whose residuals give the noise."""
-
+SETTLED = 1e-3  # sigmas; a shorter step ends the fit: each is about half the one before
+SETTLED_START = 0.1  # the same for a fit that starts another one, or whose residuals give the noise
 ITERATIONS = 30  # steps of a fit, at most
 ROUNDS = 4  # times that the noise of altitudes and the tilt by them are found in turn
 MIN_WALK = 0.02  # sigma that no integrated velocity is better than, m / sqrt(s)

@@ -21,15 +21,12 @@ from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S, Noise, bias_time_con
 from recon.similarity import Similarity
 from recon.types import F64, Bool, PosePrior
 
-BIAS_SHARE = 0.6
-"""Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""
+BIAS_SHARE = 0.6  # of a fix's sigma that differs along a flight; the rest is common to all
 
 KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
 """Sigma below which a heading counts as known, and one of a heading that is not."""
 
-USUAL_RATE_M_S, RATE_S = 0.05, 20.0
-"""Sigma of the slow part of a velocity's error, and its time constant."""
-
+USUAL_RATE_M_S, RATE_S = 0.05, 20.0  # slow part of a velocity's error: sigma and time constant
 MIN_WAY_S = 1e-3  # time that no way by velocity is shorter than
 UNKNOWNS = 11  # rotation, shift and log scale; an assumed view's mount and the drift of altitudes
 AXES = (slice(0, 2), slice(2, 3))  # those of a position that err alike: horizontal and vertical
@@ -318,10 +315,8 @@ class AlignmentReadings:
         return np.asarray(at.scale * self.step @ at.R.T - self.way)
 
     def turned(self, at: Alignment) -> tuple[F64, F64]:
-        """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone.
-
-        And (n, 3, 3) how they change with the mount.
-        """
+        """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone. And
+        (n, 3, 3) how they change with the mount."""
         n = len(self.R_odom)
         if n == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))

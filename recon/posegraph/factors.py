@@ -23,9 +23,7 @@ from recon.posegraph.sensor_offsets import FRAME_SIGMA_RAD, GATE_SIGMAS
 from recon.posegraph.smoother import NO_SCALE, Smoother
 from recon.types import F64, PosePrior
 
-HEIGHT_GATE = 0.05
-"""Share of a height by which one exactly below may be off, once its constant is out."""
-
+HEIGHT_GATE = 0.05  # share by which a height exactly below may be off, once its constant is out
 BLOCK = 20  # keyframes that share one scale and one altitude bias
 
 VELOCITY_S, FASTEST_M_S = 1.0, 100.0
@@ -42,16 +40,11 @@ KNOWN_SCALE, UNKNOWN_SCALE = 0.1, 1.0
 a track whose scale drifts; and where no reading measures it."""
 
 SIGMA_SCALE_WALK = 0.003  # sigma of the change of the scale from block to block
-
-BLOCKS_PER_HEIGHT = 2.0
-"""Heights above ground of so many blocks count as one: relief is the same under neighbours."""
-
+BLOCKS_PER_HEIGHT = 2.0  # heights of so many blocks count as one: neighbours see the same relief
 HUBER_SIGMAS = 1.5  # from so many of its residual on a reading loses weight
 FRAME_DRIFT = 0.003  # share of the path flown by which a track may leave the frame of its segment
 SIGMA_LOOP_SCALE = 0.002  # of the ratio of the depths at a loop's ends
-
-ALTITUDE_SLACK_M = 3.0
-"""An altitude further beyond its gate has stepped: pressure by a climb or a gust is less."""
+ALTITUDE_SLACK_M = 3.0  # an altitude further beyond its gate has stepped: climbs and gusts do less
 
 LINK_RAD, LINK_WITHOUT_HEADING_RAD, LINK_M, LINK_M_S = 0.3, 1.5, 5.0, 3.0
 """Sigmas of dead reckoning: of its turn, with a heading and without, and of its way at the start
@@ -127,10 +120,8 @@ class GraphFactors:
     # ---- motions -------------------------------------------------------------------------------
 
     def _first(self, node: Node) -> tuple[F64, F64]:
-        """Pose and covariance of the first keyframe: loose where readings will follow.
-
-        The gauge that no reading ever fixes is held at the start.
-        """
+        """Pose and covariance of the first keyframe: loose where readings will follow. The gauge
+        that no reading ever fixes is held at the start."""
         frame = self._segments[node.segment].frame
         T = frame.pose(node.T_odom_camera)
         sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
@@ -169,10 +160,8 @@ class GraphFactors:
         return motion, covariance, is_seen
 
     def _scale(self, node: Node, last: Node | None) -> int:
-        """Key of the node's scale, made when missing; none before its segment is placed.
-
-        A new one begins every twenty keyframes, and where vision's scale may have changed.
-        """
+        """Key of the node's scale, made when missing; none before its segment is placed. A new one
+        begins every twenty keyframes, and where vision's scale may have changed."""
         segment = self._segments[node.segment]
         if segment.similarity is None:
             return NO_SCALE

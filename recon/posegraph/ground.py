@@ -19,20 +19,12 @@ INDEPENDENT_HEIGHTS = 4.0  # heights of one flight count as so many: they share 
 UNMEASURED_HEIGHTS = 1.0
 """Heights above the take-off point, or assumed ones, count as so many: they share one offset."""
 
-GUESSED_SHARE = 0.5
-"""Relative sigma of a height that is assumed: it holds a scale that nothing else gives."""
-
-EXACT_HEIGHTS = 16.0
-"""The same where the ground exactly below was measured: relief has no part in it."""
-
-LEANING_SHARE = 2.0
-"""Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
-
+GUESSED_SHARE = 0.5  # relative sigma of an assumed height, which holds an otherwise unknown scale
+EXACT_HEIGHTS = 16.0  # the same where the ground exactly below was measured: relief has no part
+LEANING_SHARE = 2.0  # sigma of a height, as a share, per unit of (1 - cosine) off the vertical
 MIN_EXACT = 4  # heights exactly below from which on no others count
 MIN_SPREAD = 0.005  # share of a height by which readings of one flight may always differ
-
-EDGE_SHARE = 0.03
-"""Depths about the point below that differ by more than this share belong to an edge."""
+EDGE_SHARE = 0.03  # depths about the point below that differ by more belong to an edge
 
 
 def guessed_at(height_m: float | None, prior: PosePrior) -> PosePrior:
@@ -64,9 +56,7 @@ def height_above(points: F64, up: F64) -> tuple[float, float] | None:
 
 def height_below(depth: DepthMap, up: F64) -> float | None:
     """Height above the ground exactly below, in the depth map's unit; None where it is not seen.
-
-    ``up`` (3,) is the unit vector upwards in the camera's frame. Edges and holes do not count.
-    """
+    ``up`` (3,) is the unit vector upwards in the camera's frame. Edges and holes do not count."""
     down = -up
     if down[2] < 0.2:
         return None
@@ -93,11 +83,8 @@ def height_ratio(node: Node) -> tuple[float, float] | None:
 
 
 def height_ratios(nodes: Sequence[Node]) -> tuple[list[tuple[float, float]], float]:
-    """:func:`height_ratio` of the nodes that have one, and as how many independent ones they
-    count.
-
-    Measured heights stand in for all others, and heights of the ground exactly below for those.
-    """
+    """:func:`height_ratio` of the nodes that have one, and as how many independent ones they count.
+    Measured heights stand in for all others, and heights of the ground exactly below for those."""
     known = [(h, n) for n in nodes if (h := height_ratio(n)) is not None]
     measured = [(h, n) for h, n in known if n.prior.is_agl_measured]
     if not measured:
@@ -112,12 +99,8 @@ def height_ratios(nodes: Sequence[Node]) -> tuple[list[tuple[float, float]], flo
     return [h for h, off in zip(exact, apart, strict=True) if off <= limit], EXACT_HEIGHTS
 
 
-ASSUMED_TILT_RAD = math.radians(6.0)
-"""Sigma of the camera's tilt from its nominal mount without a known attitude."""
-
-MAX_SLOPE_RAD = math.radians(20.0)
-"""Few sites slope by more; a camera held by hand or by a kite line often does."""
-
+ASSUMED_TILT_RAD = math.radians(6.0)  # sigma of the tilt from the nominal mount, no attitude known
+MAX_SLOPE_RAD = math.radians(20.0)  # few sites slope by more; a camera held by hand often does
 LEVEL_SIGMA_RAD = math.radians(10.0)  # how far sites that are taken as level slope
 
 MAX_LEVELLED_SHARE = 0.2
@@ -133,9 +116,7 @@ their long lever."""
 
 def levelled(prior: PosePrior, points: F64) -> PosePrior:
     """The prior with the tilt that lays the ground level, where the assumed mount is far from it.
-
-    ``points`` (N, 3) are ground in the camera's frame. A known attitude stays.
-    """
+    ``points`` (N, 3) are ground in the camera's frame. A known attitude stays."""
     R = prior.R_world_camera
     if R is None or not prior.is_view_assumed:
         return prior

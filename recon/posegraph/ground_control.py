@@ -162,10 +162,8 @@ def supported(loops: Sequence[Loop], poses: F64 | Mapping[int, F64]) -> list[Loo
 
 
 def map_position(poses: F64, scales: F64, marks: Sequence[Mark]) -> tuple[F64, float] | None:
-    """(3,) where the map has a point, and its sigma in metres; None when it has it nowhere.
-
-    The surface at the marks, weighted; where no mark has one, the rays' nearest point.
-    """
+    """(3,) where the map has a point, and its sigma in metres; None when it has it nowhere. The
+    surface at the marks, weighted; where no mark has one, the rays' nearest point."""
     seen = [m for m in marks if m.depth_m is not None]
     if not seen:
         return _crossing(poses, marks)
@@ -217,10 +215,8 @@ def consenting(surveyed_m: F64, mapped_m: F64, sigma_m: F64) -> Bool:
 
 
 def of_marks(rows: Rows, at: State) -> Linear:
-    """Direction and, where it is known, distance of a point as an image sees it.
-
-    p = R_camera_key (R^T (P - t) - t_key_camera); the place P of a point is the shift of its key.
-    """
+    """Direction and, where it is known, distance of a point as an image sees it. p = R_camera_key
+    (R^T (P - t) - t_key_camera); the place P of a point is the shift of its key."""
     key, point, scale = rows["key"], rows["point"], rows["scale"]
     R_key_world = at.R[key].transpose(0, 2, 1)
     apart = at.t[point] - at.t[key]
@@ -248,10 +244,8 @@ def _solved(
     track: KeyframeTrack, loops: Sequence[Loop], survey: Survey,
     marks: Sequence[Mark], sigma: float, sigma_walk: float,
 ) -> Smoother:  # fmt: skip
-    """All factors of one adjustment, solved.
-
-    Keys of the smoother: keyframes, then the world itself, then points, whose turns are held.
-    """
+    """All factors of one adjustment, solved. Keys of the smoother: keyframes, then the world
+    itself, then points, whose turns are held."""
     smoother, n = Smoother(), len(track.poses)
     scale_key = _scale_key(np.arange(n)).tolist()
     for T, spread in zip(track.poses, track.covariances, strict=True):

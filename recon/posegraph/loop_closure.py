@@ -24,8 +24,7 @@ MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
 points of one depth map have in common does not average out."""
 
-SEARCH_SHARE = 0.12
-"""Search radius about the places that the graph predicts, as a share of the image's width."""
+SEARCH_SHARE = 0.12  # search radius about what the graph predicts, over the image's width
 
 MIN_MATCHES, MIN_INLIERS, MIN_INLIER_SHARE = 40, 30, 0.5
 """Corners found again, and those of them that the pose explains, and their share."""
@@ -46,10 +45,8 @@ perturbation in a's camera frame, and the growth of b's depths that fits a's."""
 
 
 def ground_seen(depth: DepthMap) -> F64:
-    """(N, 3) what a camera sees, in its frame: a grid over the whole image.
-
-    Unmeasured parts are filled by the plane through the measured ones.
-    """
+    """(N, 3) what a camera sees, in its frame: a grid over the whole image. Unmeasured parts are
+    filled by the plane through the measured ones."""
     h, w = depth.depth_m.shape
     u, v = np.meshgrid(np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 11))
     uv = np.column_stack([u.ravel(), v.ravel()])

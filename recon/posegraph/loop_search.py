@@ -22,9 +22,7 @@ MIN_GAP, MIN_OVERLAP = 10, 0.35
 """Keyframes between the two ends of a loop on one chain, and how much of the later view must lie in
 the earlier one."""
 
-TRIES = 2
-"""Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
-
+TRIES = 2  # verifications per keyframe, at most: each takes some 30 to 120 ms on one core
 COMPARED = 20  # keyframes whose look is compared with a new one's, at most: some 4 ms each
 MIN_ALIKE = 8  # features that two images of one place have in common, of their strongest
 
@@ -94,8 +92,7 @@ class LoopSearch:
         self, trajectory: Trajectory, max_views: int = 400, min_gap: int = MIN_GAP
     ) -> None:
         """Of more than ``max_views`` keyframes, about 0.1 MB each, every second of the older half
-        is forgotten.
-        """
+        is forgotten."""
         self._max_views, self._min_gap = max_views, min_gap
         self.trajectory = trajectory
         self._kept: dict[int, _Kept] = {}
@@ -161,10 +158,7 @@ class LoopSearch:
 
     def _by_look(self, new: _Kept, seqs: list[int]) -> list[int]:
         """Earlier keyframes that look like this one, the most similar first; some of them at a
-        time.
-
-        Where fixes or a loop locate the segment, its place is the better criterion.
-        """
+        time. Where fixes or a loop locate the segment, its place is the better criterion."""
         if self.trajectory.graph.segments[new.segment].is_tied:
             return []
         self._turn += 1

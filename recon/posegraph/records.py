@@ -68,10 +68,7 @@ class Loop:
 
 
 SIGMA_STEP = 0.002  # sigma of one motion of vision, as a share of its length
-
-LOOP_WINDOW = 15
-"""Keyframes within which two loops support each other: between those, vision is trusted."""
-
+LOOP_WINDOW = 15  # keyframes within which two loops support each other: vision is trusted there
 CHI2_LIMIT = 22.5  # 99.9 % of chi-square with six degrees of freedom
 
 

@@ -22,13 +22,9 @@ REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
 """A segment's similarity is fitted again when its keyframes have grown by so much: at first,
 and once it has settled."""
 
-MIN_KEYFRAMES = 3
-"""Keyframes of a segment before telemetry places it: two leave the turn about their line open."""
-
+MIN_KEYFRAMES = 3  # before telemetry places a segment: two leave the turn about their line open
 SETTLED = 100  # keyframes from which on a segment's similarity changes little
-
-HEADING_KNOWN_RAD, HEIGHT_KNOWN_M = 1.0, 20.0
-"""Sigmas of a heading and of a fix's height below which they place a segment."""
+HEADING_KNOWN_RAD, HEIGHT_KNOWN_M = 1.0, 20.0  # sigmas of heading and height that place a segment
 
 
 HEIGHTS_AGREE_M = 5.0
@@ -42,9 +38,7 @@ length are no surface beside others."""
 @dataclass(slots=True, eq=False)
 class Segment:
     """Keyframes tracked without interruption: what they share, and where they are in the world.
-
-    Vision gives them a frame and a unit of their own; ``similarity`` brings both to the world.
-    """
+    Vision gives them a frame and a unit of their own; ``similarity`` brings both to the world."""
 
     number: int
     nodes: list[Node] = field(default_factory=list)  # keyframes in the graph, in order
@@ -193,10 +187,8 @@ class Segments:
         return float(np.sqrt(sigma_m**2 + main_m**2 + drift_m**2))
 
     def apart(self, loops: Sequence[Loop]) -> list[tuple[int, int]]:
-        """First and last keyframe of the segments that nothing ties to the scan's main piece.
-
-        The main piece is the one that fixes place; without fixes, that with most points.
-        """
+        """First and last keyframe of the segments that nothing ties to the scan's main piece. The
+        main piece is the one that fixes place; without fixes, that with most points."""
         # Loads scipy.spatial, which a flight does without until its end.
         from scipy.cluster.hierarchy import DisjointSet
 
@@ -332,10 +324,8 @@ class Segments:
 
 
 def _bend_rad(nodes: list[Node]) -> float:
-    """Sigma of the turn of a segment's part against its mean, about each axis.
-
-    A random walk of variance v from end to end has v / 6 about its mean.
-    """
+    """Sigma of the turn of a segment's part against its mean, about each axis. A random walk of
+    variance v from end to end has v / 6 about its mean."""
     return float(np.sqrt(sum(np.trace(n.covariance[:3, :3]) for n in nodes[1:]) / 18.0))
 
 

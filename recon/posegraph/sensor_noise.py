@@ -20,28 +20,19 @@ BIAS_TAU_S = FIX_S, ATTITUDE_S, ALTITUDE_S = 60.0, 40.0, 120.0
 """Usual time constants with which a receiver's error wanders, an attitude's and a barometer's."""
 
 TAUS_S = (2.0, 5.0, 10.0, 20.0, 40.0)  # time constants that are tried
-
-TAUS_SEEN = 2.5
-"""Time constants that the longest lag must span, so that the variogram is seen to level off."""
-
+TAUS_SEEN = 2.5  # that the longest lag must span, so that the variogram is seen to level off
 SURE_OF_BIAS = 1.4  # a bias is accepted when the variogram fits so many times better with it
 PRECISE_TAU_S = 10.0  # time constant of a receiver's bias with RTK or PPK
 MIN_BIAS = 0.25  # share of a receiver's claimed sigma by which it always wanders
 PRECISE_M = 0.3  # fixes of a smaller sigma are RTK's or PPK's
-
-LAG_SHARE = 1.0 / 6.0
-"""Longest lag as a share of the span: a fit to the readings hides correlations over longer lags."""
-
+LAG_SHARE = 1.0 / 6.0  # longest lag over the span: a fit hides correlations over longer ones
 LAGS = 12  # bins of the variogram, in equal ratios, as correlation falls off exponentially
 
 CHI_SQUARED_MEDIANS = (0.45493642311957283, 1.3862943611198906, 2.3659738843753377)
 """Of one to three degrees of freedom."""
 
 MAX_PAIRED = 400  # readings that are compared with each other; of more, every n-th
-
-
-MIN_FRESH = 1e-9
-"""Share of a bias's variance that is new in each reading, at least: two at one time."""
+MIN_FRESH = 1e-9  # share of a bias's variance that is new in each reading: two may be at one time
 
 FLOOR_SHARE, ROUNDS = 0.05, 4
 """Least share of a model's largest value that gives weight, and times that weights are renewed."""
@@ -66,10 +57,8 @@ class Noise:
         return float(np.sqrt(2.0 * (self.white**2 + change)))
 
     def information(self, times_s: F64, extra: F64) -> F64:
-        """(N, N) inverse of the covariance of readings at (N,) times.
-
-        ``extra`` (N,) is each reading's own variance besides the white one, which is not 0.
-        """
+        """(N, N) inverse of the covariance of readings at (N,) times. ``extra`` (N,) is each
+        reading's own variance besides the white one, which is not 0."""
         P = self.weighted(times_s, extra, np.eye(len(extra)))
         if self.steady == 0.0:
             return P
@@ -143,10 +132,8 @@ class Noise:
         )
 
     def effective_sigma(self, count: int, span_s: float) -> float:
-        """The sigma of each of ``count`` readings over ``span_s``, as if all were independent.
-
-        A bias counts as 1 + span / (2 tau) independent errors.
-        """
+        """The sigma of each of ``count`` readings over ``span_s``, as if all were independent. A
+        bias counts as 1 + span / (2 tau) independent errors."""
         independent = min(1.0 + span_s / (2.0 * self.tau_s), count)
         return float(np.sqrt(self.white**2 + self.bias**2 * count / independent))
 
@@ -189,9 +176,7 @@ def gauss_markov_noise(
     times_s: F64, residuals: F64, usual_tau_s: float, sure: float = SURE_OF_BIAS
 ) -> Noise | None:
     """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.
-
-    ``usual_tau_s`` is the time constant of a bias too slow to be measured; 0: none wanders.
-    """
+    ``usual_tau_s`` is the time constant of a bias too slow to be measured; 0: none wanders."""
     lag, change = variogram(times_s, residuals)
     if len(lag) < 3:
         return None
@@ -227,9 +212,7 @@ def _fit_variogram(lag: F64, change: F64, *columns: F64) -> tuple[F64, float]:
 
 def drift_noise(times_s: F64, residuals: F64) -> tuple[float, float] | None:
     """Random walk (m / sqrt(s)) and constant rate (m / s) of a drift, 1 sigma per axis.
-
-    ``residuals`` (N, axes) m are an integrated velocity's at (N,) times; None for too few.
-    """
+    ``residuals`` (N, axes) m are an integrated velocity's at (N,) times; None for too few."""
     lag, change = variogram(times_s, residuals)
     if len(lag) < 3:
         return None

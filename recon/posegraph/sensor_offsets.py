@@ -24,13 +24,8 @@ from recon.types import F64, PosePrior
 SIGMA_RAD = np.radians(2.0)  # how well a camera is aligned before anything is known
 BOUND_RAD = np.radians(5.0)  # a larger angle is not a boresight but another fault
 MIN_ATTITUDES = 8  # minimum number of attitudes of a stretch
-
-WILD = 5.0
-"""Median of the whitened residuals beyond which attitudes and images do not belong together."""
-
-SURE = 9.0
-"""Squared sigmas by which a boresight must differ from none before attitudes are corrected."""
-
+WILD = 5.0  # median whitened residual beyond which attitudes and images do not belong together
+SURE = 9.0  # squared sigmas by which a boresight must differ from none to be applied
 ROUNDS = 6  # Gauss-Newton steps, each with new robust weights
 
 
@@ -151,17 +146,10 @@ def boresight(
 
 
 MIN_INTERVALS = 3  # minimum number of intervals between keyframes with fixes
-
-STEADY_SHARE = 0.1
-"""Share of the claimed sigma that always stays: one flight cannot show all errors of a receiver."""
-
-OFF_SIGMAS = 4.0
-"""Intervals further from the median than so many of the scatter and the sigma do not count."""
-
+STEADY_SHARE = 0.1  # of the claimed sigma that stays: one flight cannot show all errors
+OFF_SIGMAS = 4.0  # of scatter and sigma: intervals further from the median do not count
 BY_CHANCE = 2.6  # the variance of four means exceeds the true one by more in one case of twenty
-
-WILD_STEPS = 36.0
-"""Squared steps from fix to fix beyond so many of their median are jumps, not scatter."""
+WILD_STEPS = 36.0  # squared steps between fixes, over their median, beyond which they are jumps
 
 
 def altitude_datum(
@@ -228,8 +216,7 @@ FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
 and their own allow are at fault, for the gates to find; a constant within is taken out, as it would
 pull the map."""
 
-NEAR_SIGMAS = 5.0
-"""Fixes further from the track, or attitudes from their median, are no part of a constant."""
+NEAR_SIGMAS = 5.0  # fixes further from the track, attitudes from their median, are no constant's
 
 
 def constants(
@@ -238,10 +225,8 @@ def constants(
     fix_s: float = FIX_S,
     attitude_s: float = ATTITUDE_S,
 ) -> Constants:
-    """Those of a flight of ``span_s`` from poses (4, 4) and priors, segment by segment.
-
-    ``fix_s`` and ``attitude_s`` are the time constants with which the sensors wander.
-    """
+    """Those of a flight of ``span_s`` from poses (4, 4) and priors, segment by segment. ``fix_s``
+    and ``attitude_s`` are the time constants with which the sensors wander."""
     turns = [t for poses, priors in stretches if (t := turns_of(poses, priors)) is not None]
     every = [prior for _, priors in stretches for prior in priors]
     turned = boresight(turns, span_s, attitude_s)

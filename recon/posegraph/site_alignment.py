@@ -19,10 +19,7 @@ from recon.types import F64, Bool
 
 STEPS = 12  # Gauss-Newton steps, each with new robust weights
 CAUCHY_SIGMAS = 2.0  # sigmas of a tie's error, per component, beyond which it loses weight
-
-ALIKE = 5.0
-"""Sigmas of place that differ less than so many times may be of receivers that are equally good."""
-
+ALIKE = 5.0  # sigmas of place within this factor may be of receivers that are equally good
 UNKNOWNS = 7  # unknowns of a scan: rotation vector, shift of its centre, logarithm of the scale
 
 
@@ -65,11 +62,8 @@ class SiteAlignment:
 
 
 def align(ties: Sequence[Tie], centres_m: F64, sigma: F64) -> SiteAlignment:
-    """The alignment of S scans. A scan without ties stays.
-
-    Each turns and grows about its centre (S, 3); its own poses place it to a ``sigma`` (S, 7) in
-    rad, m and share.
-    """
+    """The alignment of S scans. A scan without ties stays. Each turns and grows about its centre
+    (S, 3); its own poses place it to a ``sigma`` (S, 7) in rad, m and share."""
     n = len(centres_m)
     moves = [Similarity(1.0, np.eye(3), np.zeros(3)) for _ in centres_m]
     before = _errors(ties, moves)

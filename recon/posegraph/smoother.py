@@ -20,9 +20,7 @@ from recon import parallel, se3
 from recon.table import Rows, Table
 from recon.types import F64, I64
 
-MIN_WAIT, POSES_PER_WAIT = 2, 100
-"""Poses that wait between two updates, and poses held for each further one."""
-
+MIN_WAIT, POSES_PER_WAIT = 2, 100  # poses that wait between updates; poses held for one more
 STEPS, MANY_STEPS = 1, 10  # maximum number of steps of an update, and where many poses may move far
 SMALL_STEP = 1e-3  # rad, m and log scale; none follows a step that is smaller
 SHARES = 0.5 ** np.arange(8)  # shares of a step, tried in turn until the cost falls
@@ -178,10 +176,8 @@ class System:
 
 
 def solved(factors: list[Factors], start: State, steps: int) -> System:
-    """The system about the state with the lowest cost that is found in so many steps.
-
-    Raises RuntimeError when there is none.
-    """
+    """The system about the state with the lowest cost that is found in so many steps. Raises
+    RuntimeError when there is none."""
     system = System.of(factors, start)
     if not np.isfinite(system.cost):
         raise RuntimeError("factors are not finite")
@@ -260,10 +256,8 @@ class Smoother:
         return len(self._held.at.logs) + len(self._fresh_logs) - 1
 
     def update(self, now: bool = False, steps: int = STEPS) -> bool:
-        """Solve the waiting factors if there are enough or ``now``; True when it did.
-
-        Raises RuntimeError when there is no solution; all stays as predicted then.
-        """
+        """Solve the waiting factors if there are enough or ``now``; True when it did. Raises
+        RuntimeError when there is no solution; all stays as predicted then."""
         held = self._held.at
         if not now and len(self._waiting) <= MIN_WAIT + len(held.R) // POSES_PER_WAIT:
             return False
@@ -310,10 +304,8 @@ class Smoother:
         return out
 
     def residuals(self) -> dict[str, F64]:
-        """Whitened errors of all factors by kind, one row per factor, without their losses.
-
-        Empty while something waits.
-        """
+        """Whitened errors of all factors by kind, one row per factor, without their losses. Empty
+        while something waits."""
         if self._waiting:
             return {}
         at = self._held.at

@@ -23,9 +23,7 @@ from recon.posegraph.records import Loop, Node
 from recon.posegraph.smoother import reversed_motion
 from recon.types import F64
 
-NEWEST_SHARE = 0.25
-"""Share of the newest nodes, which always stay: the next motions and loops start from them."""
-
+NEWEST_SHARE = 0.25  # of the newest nodes, which stay: the next motions and loops start from them
 GONE_SHARE = 0.25  # share of the nodes removed at once, so that rebuilding is rare
 
 

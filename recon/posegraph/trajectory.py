@@ -22,9 +22,7 @@ AT_ONCE = 600
 may wait. The rest follows with the next keyframe."""
 
 SIGMA_SHARE = 0.01  # a sigma that differs by more is published again at the end
-
-SETTLED_M = 1e-6
-"""At the end, every keyframe that moved by more is published: rounding errors are smaller."""
+SETTLED_M = 1e-6  # at the end, what moved by more is published: rounding errors are smaller
 
 KEYFRAME = np.dtype(
     [

@@ -23,11 +23,8 @@ class AdjustedTrack:
     """Takes frames as :class:`recon.tracking.odometry.Odometry` does, and says what is known."""
 
     def __init__(self, stills: Mapping[int, Frame], lens: Camera, sigma_readout_s: float) -> None:
-        """``stills`` by their number, as :func:`adjusted_still` gives them.
-
-        ``lens`` is the camera with its distortion and shutter; ``sigma_readout_s`` is 0 for one
-        that was given.
-        """
+        """``stills`` by their number, as :func:`adjusted_still` gives them. ``lens`` is the camera
+        with its distortion and shutter; ``sigma_readout_s`` is 0 for one that was given."""
         self.segment, self.keyframes = -1, list[Frame]()
         self.exposure, self.focal = ExposureWatch(), FocalWatch(lens.K)  # no window is adjusted
         self.readout = ReadoutSearch(RowClock(lens), lens.K) if sigma_readout_s else None

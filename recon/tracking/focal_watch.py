@@ -16,9 +16,7 @@ from scipy import sparse
 from recon.tracking.bundle import BundleResult, linearise_all
 from recon.types import F64, I64
 
-HUBER_PX = 1.0
-"""Longer errors lose weight: corners err by some tenths of a pixel, mismatches by more."""
-
+HUBER_PX = 1.0  # longer errors lose weight: corners err by some tenths, mismatches by more
 CELLS = 4  # rows and columns of cells of the landmarks
 
 
@@ -86,10 +84,8 @@ def _evidence(window: BundleResult, cam: I64, point: I64, uv_px: F64, K: F64) ->
 def _not_taken_up(
     values: F64, by_pose: F64, by_point: F64, cam: I64, point: I64, C: int, N: int
 ) -> F64:
-    """The remainder of ``values`` (M, 2, V) after the best change of poses and points.
-
-    ``by_pose`` (M, 2, 6) and ``by_point`` (M, 2, 3) are the derivatives.
-    """
+    """The remainder of ``values`` (M, 2, V) after the best change of poses and points. ``by_pose``
+    (M, 2, 6) and ``by_point`` (M, 2, 3) are the derivatives."""
     rows, flat = np.arange(len(cam) + 1), values.reshape(-1, values.shape[2])
     P = sparse.bsr_array((by_pose, cam, rows), (len(flat), 6 * C))
     X = sparse.bsr_array((by_point, point, rows), (len(flat), 3 * N))

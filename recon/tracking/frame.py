@@ -34,10 +34,8 @@ class Tracking(str, Enum):
 
 
 class Landmarks:
-    """Points (x, y, z) of one segment by number; a dropped point is NaN.
-
-    Numbers only grow; :meth:`forget_before` frees those that no keyframe refers to.
-    """
+    """Points (x, y, z) of one segment by number; a dropped point is NaN. Numbers only grow;
+    :meth:`forget_before` frees those that no keyframe refers to."""
 
     def __init__(self) -> None:
         self._xyz = np.zeros((0, 3))

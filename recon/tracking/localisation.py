@@ -54,11 +54,7 @@ by more, so it is a false solution."""
 
 LOOSE_PX = 6.0  # gate of a second try: a rolling shutter bends images that much
 LOW_RATE_GAP_S = 0.7  # frames further apart are stills: no motion model holds
-
-RECALLED = 4
-"""Newest keyframes that a frame is compared with by features: of stills with 75 % overlap no
-more show the same ground."""
-
+RECALLED = 4  # newest keyframes compared by features: at 75 % overlap no more share the ground
 CLEAR_SHARE = 0.6  # share of the corners searched: if so many are found, no other start is tried
 
 
@@ -358,10 +354,8 @@ class Localiser:
     def _solve(
         self, points: F64, uv: F64, start: F64, least: int, row_motion: FrameRows
     ) -> pnp.PnpResult | None:
-        """EPnP with a tight gate, else with a loose one; None with fewer than ``least``.
-
-        The pose says how the rows moved, so it is solved again with that motion.
-        """
+        """EPnP with a tight gate, else with a loose one; None with fewer than ``least``. The pose
+        says how the rows moved, so it is solved again with that motion."""
         for gate_px in (pnp.THRESHOLD_PX, LOOSE_PX):
             solved = self._solve_rows(points, uv, start, gate_px, row_motion)
             if solved is not None and row_motion.rows is not None:
@@ -381,10 +375,8 @@ class Localiser:
         return pnp.solve(points, middle, self.camera.K, start, gate_px)
 
     def _agrees(self, T_camera_odom: F64, prior: PosePrior, key: Frame, tilt_only: bool) -> bool:
-        """False when vision turned otherwise than telemetry since the keyframe.
-
-        ``tilt_only`` where vision is sure of the heading: tags and compasses are often wrong.
-        """
+        """False when vision turned otherwise than telemetry since the keyframe. ``tilt_only`` where
+        vision is sure of the heading: tags and compasses are often wrong."""
         turn = prediction.relative_rotation(key.prior, prior)
         if turn is None:
             return True
@@ -460,10 +452,8 @@ class Localiser:
 
 
 def match_images(a: Frame, b: Frame, low_frame_rate: bool) -> FeatureMatches | None:
-    """The features that two frames share, or None.
-
-    Stills are compared in finer detail where they need it: they are few and far apart.
-    """
+    """The features that two frames share, or None. Stills are compared in finer detail where they
+    need it: they are few and far apart."""
     shared = match_features(*(_features(image, WIDTH_PX, MOST) for image in (a, b)))
     return match_finely(a, b) if shared is None and low_frame_rate else shared
 

@@ -15,9 +15,7 @@ import numpy as np
 from recon.types import F64, U8
 
 LAGS = 64  # longest streak that is looked for, in px
-
-SIDE_SHARE = 0.7
-"""Side of the square in the middle of the image, over the image's shorter side: fits turned."""
+SIDE_SHARE = 0.7  # side of the square looked at over the image's shorter side: fits turned
 
 BOX_PER_ZERO = 1.25
 """Streak over the first zero of its gradients' autocorrelation. Without other blur it would be 1;
@@ -35,10 +33,8 @@ KEPT, MIN_KNOWN = 15, 5  # keyframes that the exposure follows from, at most and
 
 
 def streak_px(gray: U8, direction: F64) -> float:
-    """Length in px by which an image (H, W) is smeared along a ``direction`` (2,) in it.
-
-    Blur in all directions cancels. NaN without texture.
-    """
+    """Length in px by which an image (H, W) is smeared along a ``direction`` (2,) in it. Blur in
+    all directions cancels. NaN without texture."""
     along, across = (_first_zero(gray, d) for d in (direction, direction[::-1] * [-1.0, 1.0]))
     return float(BOX_PER_ZERO * np.sqrt(max(along**2 - across**2, 0.0)))
 

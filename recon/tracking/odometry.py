@@ -53,8 +53,7 @@ WINDOW = 8
 """Keyframes adjusted together. Of those further back, 0.8 of the height and more, a wide image
 shows nothing any more."""
 
-LOST_AFTER = 8
-"""Frames in a row without a pose before a new segment starts: a third of a second of video."""
+LOST_AFTER = 8  # frames in a row without a pose before a new segment: a third of a second of video
 
 OVERDUE = 1.3
 """A blurred frame becomes a keyframe when the last is this many steps away: partners may be 2.2
@@ -113,9 +112,7 @@ class Odometry:
 
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
         """True for a frame that :meth:`track` need not see: the camera has hardly moved since.
-
-        ``frames_per_step`` is how many frames at least are followed from keyframe to keyframe.
-        """
+        ``frames_per_step`` is how many frames at least are followed from keyframe to keyframe."""
         if not self._is_metric or self._lost:
             return False
         moved, turned, gap_s = self._motion_model.shift(time_ns, prior, self._depth)
@@ -283,10 +280,8 @@ class Odometry:
         return self._accept_two_views(new, (first, second @ first.T_camera_odom, uv, ok))
 
     def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
-        """True where no turn of the camera explains matched pixels (N, 2).
-
-        A camera that circles a place keeps it in the middle: it moves, but the image does not.
-        """
+        """True where no turn of the camera explains matched pixels (N, 2). A camera that circles a
+        place keeps it in the middle: it moves, but the image does not."""
         off_px = float(self.K[0, 0]) * prediction.beyond_turn(uv_a, uv_b, self.K)
         return off_px > 2.0 * two_view.MAX_ERROR_PX
 

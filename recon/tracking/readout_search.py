@@ -31,10 +31,7 @@ FLOOR_S = 1e-4  # sigma of the row motion's own errors
 BENT = 0.1  # of the way from the readout in use, by which the rows' motion was bent: a sigma
 MIN_WINDOWS = 2  # fewer make nothing sure
 GLOBAL_S = 5e-4  # a readout and a sigma below it show a global shutter
-
-HUBER_PX = 1.0
-"""Longer errors lose weight: corners err by some tenths of a pixel, mismatches by more."""
-
+HUBER_PX = 1.0  # longer errors lose weight: corners err by some tenths, mismatches by more
 USUAL_S = 0.02  # sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms
 
 
@@ -43,11 +40,8 @@ Cost = Callable[["list[Frame]", float, F64], tuple[float, int]]
 
 
 class ReadoutSearch:
-    """Looks at keyframes as they settle, and sets the clock of their rows.
-
-    ``readout_s`` is negative against the shutter's direction; ``windows`` of keyframes show it, 0
-    until one does.
-    """
+    """Looks at keyframes as they settle, and sets the clock of their rows. ``readout_s`` is
+    negative against the shutter's direction; ``windows`` of keyframes show it, 0 until one does."""
 
     def __init__(self, clock: RowClock, K: F64, cost: Cost | None = None) -> None:
         """``cost`` says how well a window fits a readout; by default :func:`window_cost`."""
@@ -80,10 +74,8 @@ class ReadoutSearch:
         return min(float(np.hypot(self.sigma_s, off_s)), USUAL_S)
 
     def look(self, keyframes: list[Frame]) -> bool:
-        """Search once the newest of the ``keyframes``, all settled, ends a further window.
-
-        True where this changes the readout in use.
-        """
+        """Search once the newest of the ``keyframes``, all settled, ends a further window. True
+        where this changes the readout in use."""
         before_s = self._clock.readout_s
         size = KEYFRAMES if self.is_sure or self.doubt_s == 0.0 else FIRST_KEYFRAMES
         window = keyframes[-size:]

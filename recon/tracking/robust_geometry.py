@@ -18,15 +18,10 @@ from recon.types import F64, Array, Bool
 
 MIN_SPREAD = {2: 1e-5, 3: 1e-8}
 """Least extent of pixels (2) and points (3) across their line, as a share of the extent along it.
+Pixels are float32, which limits them; points may have wild outliers along the line of sight."""
 
-Pixels are float32, which limits them; points may have wild outliers along the line of sight.
-"""
-
-MIN_RESOLUTION = 1e-12
-"""Least extent of points as a share of their largest coordinate: less is rounding."""
-
-RELATIVE_POSE_PX = 1.0
-"""Distance from its epipolar line below which a match supports a relative pose."""
+MIN_RESOLUTION = 1e-12  # least extent of points over their largest coordinate: less is rounding
+RELATIVE_POSE_PX = 1.0  # from its epipolar line, below which a match supports a relative pose
 
 _T = TypeVar("_T")
 
@@ -57,10 +52,8 @@ def _spans_a_plane(points: F64) -> bool:
 
 
 def pose_from_points(points_m: F64, uv_px: F64, K: F64, flags: int) -> F64 | None:
-    """(4, 4) T_camera_points of (N, 3) points at (N, 2) pixels; N is 4 or more.
-
-    ``flags`` is one of OpenCV's SOLVEPNP methods, such as EPnP.
-    """
+    """(4, 4) T_camera_points of (N, 3) points at (N, 2) pixels; N is 4 or more. ``flags`` is one of
+    OpenCV's SOLVEPNP methods, such as EPnP."""
     if len(points_m) < 4 or not span_a_plane(points_m, uv_px):
         return None
     found = attempt(lambda: cv2.solvePnP(points_m, uv_px, K, None, flags=flags))
@@ -99,10 +92,8 @@ def _essential(uv_a: F64, uv_b: F64, K: F64, threshold_px: float) -> tuple[Array
 
 
 def relative_pose(uv_a: F64, uv_b: F64, K: F64) -> tuple[F64, F64, int] | None:
-    """(R_b_a, unit t of T_b_a, points in front of both cameras) of (N, 2) matched pixels.
-
-    By the essential matrix. None also where no essential matrix explains the matches.
-    """
+    """(R_b_a, unit t of T_b_a, points in front of both cameras) of (N, 2) matched pixels. By the
+    essential matrix. None also where no essential matrix explains the matches."""
     found = _essential(uv_a, uv_b, K, RELATIVE_POSE_PX)
     if found is None:
         return None

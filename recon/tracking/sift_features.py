@@ -23,9 +23,7 @@ FINE_WIDTH_PX, FINE_MOST = 960, 3000
 """For stills that share too few of those: treetops look alike, or different, in a small image."""
 
 RATIO = 0.8  # distance to the best descriptor over that to the second best, at most
-
-GATE_SHARE = 0.015
-"""Share of the image's width by which a match may miss the common homography: relief."""
+GATE_SHARE = 0.015  # of the width, by which relief may move a match off the common homography
 
 MIN_MATCHES, MIN_MATCH_SHARE = 14, 0.5
 """That follow one homography, and their share of all matches; strangers have 7 of 27."""

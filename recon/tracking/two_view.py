@@ -24,8 +24,7 @@ MIN_PARALLAX_RAD, MIN_INLIERS = 2e-3, 20
 """Between the rays of a point, a pixel at a focal length of 500 px; and points that give a motion,
 which has five numbers."""
 
-AS_GOOD = 0.92
-"""Of the most inliers: motions with as many explain the pixels alike, and the ground decides."""
+AS_GOOD = 0.92  # of the most inliers: motions with as many explain pixels alike, the ground decides
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,18 +24,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOOK_S = 1.0  # between two looks at what the ground lacks
-
-OWN_LINKS = "mavlink"
-"""The value of ``datalink.radio`` that means the links of the [mavlink] section."""
+OWN_LINKS = "mavlink"  # of ``datalink.radio``: the links of the [mavlink] section
 
 
 def open_datalink(
     store: ScanStore, config: Config, own_links: Carrier | None = None
 ) -> DatalinkSender | None:
-    """A sender of what the store gets, or None when no ground station is configured.
-
-    ``own_links`` are the vehicle's links; without a vehicle, as in a replay, there are none.
-    """
+    """A sender of what the store gets, or None when no ground station is configured. ``own_links``
+    are the vehicle's links; without a vehicle, as in a replay, there are none."""
     datalink, radio = config.datalink, own_links
     if datalink.radio != OWN_LINKS:
         radio = None
@@ -51,10 +47,8 @@ def open_datalink(
 
 
 def open_backlog(config: Config) -> DatalinkSender | None:
-    """A sender of earlier scans that the ground lacks, for the time between flights.
-
-    None when no ground station is configured or it has everything. Close it before a scan.
-    """
+    """A sender of earlier scans that the ground lacks, for the time between flights. None when no
+    ground station is configured or it has everything. Close it before a scan."""
     from service.stream.reports import open_undelivered
 
     if not (config.datalink.connect or config.datalink.listen):
@@ -71,10 +65,8 @@ def open_backlog(config: Config) -> DatalinkSender | None:
 
 
 def deliver(sender: DatalinkSender, max_s: float, wait: Callable[[], None] = lambda: None) -> None:
-    """Wait until a ground station that is heard has everything, and log what is missing.
-
-    ``wait`` is called about once a second.
-    """
+    """Wait until a ground station that is heard has everything, and log what is missing. ``wait``
+    is called about once a second."""
     end_s = time.monotonic() + max_s
     while not sender.drain(min(LOOK_S, max_s)):
         now = sender.progress
@@ -87,10 +79,8 @@ def deliver(sender: DatalinkSender, max_s: float, wait: Callable[[], None] = lam
 
 
 class DaemonLink:
-    """The datalink over a daemon's life: a scan's sender while one runs, else the backlog.
-
-    Safe between threads; nothing here waits for the link.
-    """
+    """The datalink over a daemon's life: a scan's sender while one runs, else the backlog. Safe
+    between threads; nothing here waits for the link."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -100,10 +90,8 @@ class DaemonLink:
         self._radio: VehicleRadio | None = None
 
     def begin_scan(self, store: ScanStore, config: Config, vehicle: VehicleLink) -> None:
-        """Send a scan, in place of the backlog, to the ground stations that are configured.
-
-        Where that cannot be done, the operator is warned, and the scan is only stored.
-        """
+        """Send a scan, in place of the backlog, to the ground stations that are configured. Where
+        that cannot be done, the operator is warned, and the scan is only stored."""
         self.end_backlog()
         if config.datalink.radio == OWN_LINKS and self._radio is None:
             from service.radio import VehicleRadio
@@ -132,10 +120,8 @@ class DaemonLink:
         sender.close()
 
     def offer_backlog(self, config: Config, is_idle: Callable[[], bool] = lambda: True) -> None:
-        """Send earlier scans that the ground lacks, while ``is_idle`` is true.
-
-        Ends with :meth:`begin_scan` or :meth:`end_backlog`.
-        """
+        """Send earlier scans that the ground lacks, while ``is_idle`` is true. Ends with
+        :meth:`begin_scan` or :meth:`end_backlog`."""
         with self._lock:
             if self._wish is not None or not is_idle():
                 return

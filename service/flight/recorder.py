@@ -58,10 +58,7 @@ FRAME = np.dtype(
 
 class PublishedFrames:
     """Published poses of the frames that refer to a keyframe, in order; on the disk but for the
-    newest.
-
-    The file has no name and is gone with the process.
-    """
+    newest. The file has no name and is gone with the process."""
 
     def __init__(self, folder: Path) -> None:
         self._fresh: deque[tuple[Frame, Any]] = deque()

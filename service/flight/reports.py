@@ -204,10 +204,8 @@ class TrackingWatch:
 
 
 def motion_blur(exposure: ExposureWatch, px_per_px: float) -> dict[str, Any] | None:
-    """The strongest blur so far, fit for JSON; None while the images are sharp.
-
-    ``px_per_px``: pixels of the recording to one of the images that are tracked.
-    """
+    """The strongest blur so far, fit for JSON; None while the images are sharp. ``px_per_px``:
+    pixels of the recording to one of the images that are tracked."""
     if exposure.strongest is None:
         return None
     blur_px, exposure_s = exposure.strongest

@@ -52,10 +52,8 @@ MIN_FOCAL_OFF, FOCAL_OFF_SIGMAS = 0.01, 4.0
 
 @contextmanager
 def short_collections() -> Iterator[None]:
-    """The collector of garbage looks only at what is made inside.
-
-    To look at all that a process has loaded stops every thread for 50 ms and more.
-    """
+    """The collector of garbage looks only at what is made inside. To look at all that a process has
+    loaded stops every thread for 50 ms and more."""
     gc.collect()
     gc.freeze()
     try:
@@ -249,10 +247,8 @@ class Scan:
         paused: Event | None = None,
         is_enough: Callable[[Scan], object] = lambda scan: False,
     ) -> None:
-        """Feed every frame of the source until it ends, ``stop`` is set or it ``is_enough``.
-
-        Frames that come while ``paused`` is set are passed over. A recording is decoded ahead.
-        """
+        """Feed every frame of the source until it ends, ``stop`` is set or it ``is_enough``. Frames
+        that come while ``paused`` is set are passed over. A recording is decoded ahead."""
         live = self.source.is_live
         quiet = short_collections() if live else nullcontext()  # stops do a replay no harm
         coverage = covering(self.store) if live else nullcontext()
