@@ -18,10 +18,11 @@ from statistics import NormalDist
 
 import cv2
 import numpy as np
+from numba import njit
 from scipy import ndimage
 
 from recon.surface.raster import Grid, Raster, fill_holes, highest_lowest
-from recon.types import F32, F64, I32, U8, Bool
+from recon.types import F32, F64, I32, I64, U8, Bool
 
 BEND_CELLS, BEND_ROUNDS = 8, 8
 """Blocks per length over which flights bend, and iterations of the robust mean."""
@@ -104,11 +105,12 @@ def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
 
 
 def level_filled(raster: Raster, cells: int) -> Raster:
-    """The surface with its holes up to ``cells`` wide filled, but not next to steps.
+    """The surface with its holes up to ``cells`` wide filled, next to steps only between two level
+    cells.
 
-    Ground next to a step is unknown because it is hidden, or because stereo mixed both heights
-    there: a mean of the two would make whatever stands wider. A step rises by more than 45 degrees
-    over the ``cells`` around.
+    Other ground next to a step is unknown because it is hidden, or because stereo mixed both
+    heights there: a mean of the two would make whatever stands wider. A step rises by more than 45
+    degrees over the ``cells`` around.
     """
     filled = fill_holes(raster, cells)
     high, low = highest_lowest(raster.height_m, cells)
@@ -116,7 +118,40 @@ def level_filled(raster: Raster, cells: int) -> Raster:
     height, sigma = (
         np.where(is_step, np.float32(np.nan), x) for x in (filled.height_m, filled.sigma_m)
     )
+    own = raster.height_m, raster.sigma_m, raster.rgb
+    _bridge(np.argwhere(is_step), cells, raster.grid.cell_m, *own, height, sigma, filled.rgb)
     return replace(filled, height_m=height, sigma_m=sigma)
+
+
+@njit(cache=True, nogil=True)
+def _bridge(
+    holes: I64, cells: int, cell_m: float, height: F32, sigma: F32, rgb: U8,
+    to_height: F32, to_sigma: F32, to_rgb: U8,
+) -> None:  # fmt: skip
+    """Fill those of the ``holes`` (N, 2) that lie across a gap of at most ``cells`` between two
+    cells that rise by at most 45 degrees from one to the other, of several the narrowest gap."""
+    rows, cols = height.shape
+    for r, c in holes:
+        best = cells + 2
+        for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            a = b = 0
+            for n in range(1, cells + 1):
+                u, v = r - n * dr, c - n * dc
+                if a == 0 and 0 <= u < rows and 0 <= v < cols and np.isfinite(height[u, v]):
+                    a = n
+                u, v = r + n * dr, c + n * dc
+                if b == 0 and 0 <= u < rows and 0 <= v < cols and np.isfinite(height[u, v]):
+                    b = n
+            if a == 0 or b == 0 or a + b >= best:
+                continue
+            i, j, k, m = r - a * dr, c - a * dc, r + b * dr, c + b * dc
+            if abs(height[i, j] - height[k, m]) > (a + b) * cell_m:
+                continue
+            best, near = a + b, a / (a + b)
+            to_height[r, c] = height[i, j] + near * (height[k, m] - height[i, j])
+            to_sigma[r, c] = sigma[i, j] + sigma[k, m]
+            for n in range(3):
+                to_rgb[r, c, n] = np.rint(0.5 * (float(rgb[i, j, n]) + float(rgb[k, m, n])))
 
 
 def change_between(

@@ -75,6 +75,21 @@ def test_unknown_ground_around_a_box_does_not_make_it_wider() -> None:
     assert np.isfinite(filled.height_m[2:15, 7::23]).all()  # level ground is closed
 
 
+def test_gaps_between_level_cells_are_closed_up_to_the_edge_of_a_roof_and_no_further() -> None:
+    whole = surface(1, [(60, 60, 40, 40, 6.0)])
+    height = whole.height_m.copy()
+    height[58:102, [59, 61, 80, 98]] = np.nan  # beside the roof, and through it along its edges
+    height[[60, 99], 85:90] = np.nan  # the edges themselves
+    filled = level_filled(replace(whole, height_m=height), 2)
+    assert np.isfinite(filled.height_m[61:99, [61, 80, 98]]).all()
+    assert np.abs(filled.height_m - whole.height_m)[61:99, [61, 80, 98]].max() < 6 * SIGMA_M
+    assert np.isnan(filled.height_m[62:98, 59]).all() and np.isnan(filled.height_m[60, 85:90]).all()
+    rows = slice(61, 99)
+    assert (filled.rgb[rows, 61] == whole.rgb[rows, 60]).all()
+    ends = whole.sigma_m[rows, 60] + whole.sigma_m[rows, 62]
+    np.testing.assert_allclose(filled.sigma_m[rows, 61], ends)
+
+
 def test_boxes_of_a_metre_and_forty_centimetres_are_found() -> None:
     boxes = [(20 + 40 * (k // 5), 20 + 40 * (k % 5), 5, 5, 0.4 + 0.02 * k) for k in range(25)]
     found = change_between(surface(1, []), surface(2, boxes))
