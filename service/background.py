@@ -24,10 +24,8 @@ LOOK_S = 0.2
 
 
 class Channel(Generic[T]):
-    """A bounded queue between two threads: one iterates over it, the other calls :meth:`fill`.
-
-    When it is full, the filling thread waits, or with ``drops`` the oldest entry is lost.
-    """
+    """A bounded queue between two threads: one iterates over it, the other calls :meth:`fill`. When
+    it is full, the filling thread waits, or with ``drops`` the oldest entry is lost."""
 
     def __init__(self, bound: int, drops: bool) -> None:
         self._bound, self._drops = bound, drops
@@ -162,10 +160,8 @@ class BackgroundWorker(Generic[In, Out]):
             self.dropped += self._counts(self._offered.pop(late))
 
     def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
-        """Finished work, in order; ``everything`` waits for the rest.
-
-        Raises what work raised, but first returns what was done before it.
-        """
+        """Finished work, in order; ``everything`` waits for the rest. Raises what work raised, but
+        first returns what was done before it."""
         out: list[tuple[In, Out]] = []
         while self._offered:
             future = next(iter(self._offered))

@@ -70,10 +70,8 @@ SERVICES = ("run", "ground")
 
 
 class LazyCommands(typer.core.TyperGroup):
-    """A command group that imports a subcommand's module only when it is called.
-
-    Contexts and commands are ``Any``: some typer releases bring their own copy of click.
-    """
+    """A command group that imports a subcommand's module only when it is called. Contexts and
+    commands are ``Any``: some typer releases bring their own copy of click."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(COMMANDS)
@@ -151,9 +149,7 @@ def _root(
 
 def _end_by_signals() -> None:
     """Let a signal that would kill the process unwind it, so that it removes temporary files.
-
-    Commands that stop in order replace this; ``nohup`` stays in force.
-    """
+    Commands that stop in order replace this; ``nohup`` stays in force."""
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, lambda number, _: sys.exit(128 + number))

@@ -10,10 +10,8 @@ from service.redaction import without_credentials
 
 
 class SkyreliefError(Exception):
-    """A failure that a person can act on; its text is one line: what, where, what to do.
-
-    The text is published (status, MAVLink, scan.json, logs), so credentials in it are hidden.
-    """
+    """A failure that a person can act on; its text is one line: what, where, what to do. The text
+    is published (status, MAVLink, scan.json, logs), so credentials in it are hidden."""
 
     exit_code = 1
 

@@ -82,10 +82,8 @@ class LocalFrame:
         return self.to_enu(out[:, [1, 0, 2]])
 
     def from_utm_grid(self, x_m: F64, y_m: F64, height_m: Array) -> F64:
-        """(R, C, 3) ENU metres of eastings (C,), northings (R,) and AMSL metres (R, C).
-
-        As :meth:`from_utm` to within 3 mm over 10 km, and much faster.
-        """
+        """(R, C, 3) ENU metres of eastings (C,), northings (R,) and AMSL metres (R, C). As
+        :meth:`from_utm` to within 3 mm over 10 km, and much faster."""
 
         def foot_and_up(xy: F64) -> F64:
             low = self.from_utm(np.column_stack([xy, np.zeros(len(xy))]))
@@ -113,10 +111,8 @@ NODES = 33
 
 
 def between_nodes(x: F64, y: F64, function: Callable[[F64], Array]) -> Array:
-    """(K, R, C) of a smooth ``function`` from (N, 2) to (N, K), at all of x (C,) and y (R,).
-
-    It is called for NODES places along each side and interpolated linearly between them.
-    """
+    """(K, R, C) of a smooth ``function`` from (N, 2) to (N, K), at all of x (C,) and y (R,). It is
+    called for NODES places along each side and interpolated linearly between them."""
     (at_x, from_x), (at_y, from_y) = _nodes(x), _nodes(y)
     places = np.stack(np.meshgrid(at_x, at_y), axis=-1).reshape(-1, 2)
     found = function(places).T.reshape(-1, len(at_y), len(at_x))
@@ -130,10 +126,8 @@ def _nodes(x: F64) -> tuple[F64, F64]:
 
 
 def cut_at_180(places: F64) -> list[F64]:
-    """A line (N, K) of longitude, latitude and more columns, cut where it crosses 180 degrees.
-
-    The parts end at -180 or 180, as RFC 7946 (3.1.9) asks for.
-    """
+    """A line (N, K) of longitude, latitude and more columns, cut where it crosses 180 degrees. The
+    parts end at -180 or 180, as RFC 7946 (3.1.9) asks for."""
     lon = np.unwrap(places[:, 0], period=360.0)  # without a step at 180 degrees
     turns = np.floor((lon + 180.0) / 360.0)  # a piece of the line lies in one turn
     parts, first = [], 0
@@ -167,9 +161,7 @@ def geojson_of(features: Iterable[Feature]) -> str:
 
 def map_crs(epsg: int, vertical: str | None = None) -> CRS:
     """The map's coordinate system; with the name of a vertical datum that of its heights as well.
-
-    Nothing is converted, so no geoid grid is needed.
-    """
+    Nothing is converted, so no geoid grid is needed."""
     from pyproj import CRS
 
     flat = CRS.from_epsg(epsg)
@@ -248,10 +240,8 @@ def _parts_of(text: str) -> tuple[Transformer, CRS, list[CRS]]:
 
 
 def degrees_of(system: Transformer, x: float, y: float) -> tuple[float, float]:
-    """Longitude and latitude of a place in a surveyor's coordinate system.
-
-    ValueError where the system does not reach so far: PROJ's series then give some other place.
-    """
+    """Longitude and latitude of a place in a surveyor's coordinate system. ValueError where the
+    system does not reach so far: PROJ's series then give some other place."""
     lon, lat = system.transform(x, y)
     back = system.transform(lon, lat, direction="INVERSE")
     if not all(
@@ -331,10 +321,8 @@ GRID_AREA_DEG = 0.05
 
 
 def vertical_code(name: str) -> int | None:
-    """EPSG code of the heights ``name`` (of DATUMS, or ``EPSG:n``); None for the ellipsoid.
-
-    Raises ValueError for what is not a vertical datum.
-    """
+    """EPSG code of the heights ``name`` (of DATUMS, or ``EPSG:n``); None for the ellipsoid. Raises
+    ValueError for what is not a vertical datum."""
     if name in DATUMS:
         return DATUMS[name]
     from pyproj import CRS
@@ -358,10 +346,8 @@ class HeightChange:
     transformer: Transformer
 
     def __call__(self, geodetic: F64, undo: bool = False) -> F64:
-        """(N, 3) latitude, longitude (degrees) and the height above the other datum, metres.
-
-        Raises InputError where the grid ends.
-        """
+        """(N, 3) latitude, longitude (degrees) and the height above the other datum, metres. Raises
+        InputError where the grid ends."""
         lat, lon, height = geodetic.T
         changed = _apply(self.transformer, lon, lat, height, inverse=undo)[:, 2]
         out = np.column_stack([lat, lon, changed])
@@ -372,9 +358,7 @@ class HeightChange:
 
 def height_change(source: str, target: str, lat_deg: float, lon_deg: float) -> HeightChange | None:
     """The conversion of heights near a place by PROJ's grids; None where both datums are one.
-
-    Raises InputError when a grid is missing or PROJ knows no conversion; no offset is assumed.
-    """
+    Raises InputError when a grid is missing or PROJ knows no conversion; no offset is assumed."""
     from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
     from pyproj.transformer import AreaOfInterest, TransformerGroup
 

@@ -58,10 +58,8 @@ class _Connection:
 
 
 class BoundedListener(socket.socket):
-    """A listening TCP socket with limits. Use from one thread.
-
-    Raises OSError when HOST:PORT is not available.
-    """
+    """A listening TCP socket with limits. Use from one thread. Raises OSError when HOST:PORT is not
+    available."""
 
     def __init__(
         self,

@@ -48,10 +48,8 @@ def loading() -> Iterator[None]:
 
 
 def release_memory(collect: bool = False) -> bool:
-    """Return freed memory to the system; True when it did. Takes a millisecond or two.
-
-    With ``collect`` reference cycles are freed first, as after a scan; that takes longer.
-    """
+    """Return freed memory to the system; True when it did. Takes a millisecond or two. With
+    ``collect`` reference cycles are freed first, as after a scan; that takes longer."""
     if collect:
         gc.collect()
     libc = _libc("malloc_trim")

@@ -47,10 +47,8 @@ class RadioLink:
         self._decoder = Decoder()
 
     def open(self, on_status: Callable[[int], None] = lambda _: None) -> None:
-        """Open the endpoint, and reopen it whenever it fails.
-
-        ``on_status`` gets the free share of the radio's buffer in percent, on the reading thread.
-        """
+        """Open the endpoint, and reopen it whenever it fails. ``on_status`` gets the free share of
+        the radio's buffer in percent, on the reading thread."""
         self._on_status = on_status
         self._link.start()
 

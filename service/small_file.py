@@ -37,10 +37,8 @@ def read_small(path: Path, max_bytes: int, what: str) -> bytes:
 
 
 def read_json(path: Path, kind: type[T], max_bytes: int, what: str) -> T:
-    """The ``kind`` that the regular file at ``path`` holds as JSON.
-
-    Raises InputError as :func:`read_small`, and for any other content.
-    """
+    """The ``kind`` that the regular file at ``path`` holds as JSON. Raises InputError as
+    :func:`read_small`, and for any other content."""
     data = read_small(path, max_bytes, what)
     try:
         return msgspec.json.decode(data, type=kind)

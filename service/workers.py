@@ -144,10 +144,8 @@ class Worker:
 
     @property
     def is_stalled(self) -> bool:
-        """Whether it runs and has made no progress for its row's deadline.
-
-        Only restarting workers are judged by their beats; the service judges a scan itself.
-        """
+        """Whether it runs and has made no progress for its row's deadline. Only restarting workers
+        are judged by their beats; the service judges a scan itself."""
         if self.row.deadline_s is None or not self.row.restarts or self.is_done:
             return False
         return time.monotonic() - self.beat_at > self.row.deadline_s
@@ -303,10 +301,8 @@ def python_command(module: str, *arguments: str) -> list[str]:
 
 
 def open_process(name: str, command: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
-    """Start a process of the table, with the ``streams`` of Popen; its owner ends it.
-
-    Ctrl-C in a terminal does not reach it; its owner ends it in order.
-    """
+    """Start a process of the table, with the ``streams`` of Popen; its owner ends it. Ctrl-C in a
+    terminal does not reach it; its owner ends it in order."""
     row_of(name)
     _PROCESSES[:] = [(n, p) for n, p in _PROCESSES if p.poll() is None]
     process = subprocess.Popen(command, start_new_session=True, **streams)
@@ -323,9 +319,7 @@ def end_processes() -> None:
 
 def run_process(worker: Worker, row: str, command: Sequence[str]) -> None:
     """Keep a process of the table until the worker's stop, which ends its standard input too.
-
-    Raises OutsideError when it ends before.
-    """
+    Raises OutsideError when it ends before."""
     process = open_process(row, command, stdin=subprocess.PIPE)
     try:
         while not worker.stop.wait(LOOK_S):
@@ -380,10 +374,8 @@ def end_process(
 
 
 def running() -> list[dict[str, Any]]:
-    """Running and failed threads and processes of this process, in the table's order.
-
-    Threads that start themselves are found by name.
-    """
+    """Running and failed threads and processes of this process, in the table's order. Threads that
+    start themselves are found by name."""
     with _ALL_LOCK:
         groups = list(_ALL)
     workers = [w for group in groups for w in group.table() if w.has_failed or not w.is_done]

@@ -68,10 +68,8 @@ def is_stop(call: Call) -> bool:
 
 
 def start_scan(call: Call, host: Host) -> Handled:
-    """VIDEO_START_CAPTURE: start or resume a scan; a second start changes nothing.
-
-    Param 2 requests CAMERA_CAPTURE_STATUS at that rate in Hz (0: none) until the scan ends.
-    """
+    """VIDEO_START_CAPTURE: start or resume a scan; a second start changes nothing. Param 2 requests
+    CAMERA_CAPTURE_STATUS at that rate in Hz (0: none) until the scan ends."""
     return _start(call, host, call.param(2, 0.0))
 
 
@@ -100,21 +98,16 @@ def _start(call: Call, host: Host, status_hz: float = 0.0) -> Handled:
 
 
 def _stop(host: Host, how: Callable[[], Handled]) -> Handled:
-    """End the scan, its retries and the series of photos.
-
-    ``how`` is the control's method of stopping. It is called in every state, because a scan may
-    be pending although none runs.
-    """
+    """End the scan, its retries and the series of photos. ``how`` is the control's method of
+    stopping. It is called in every state, because a scan may be pending although none runs."""
     handled = how()
     host.camera.stop_shooting()
     return handled
 
 
 def set_baseline(call: Call, host: Host) -> Handled:
-    """DO_SET_CAM_TRIGG_DIST: set the virtual stereo baseline.
-
-    Param 1: metres, 0 lets it follow the altitude; param 3 = 1 takes a photo now.
-    """
+    """DO_SET_CAM_TRIGG_DIST: set the virtual stereo baseline. Param 1: metres, 0 lets it follow the
+    altitude; param 3 = 1 takes a photo now."""
     answer = host.parameters.change("SR_BASELINE_M", call.param(1, 0.0))
     if answer.result is Result.ACCEPTED and call.param(3, 0.0) == 1.0:
         host.camera.shoot()
@@ -177,10 +170,8 @@ def stop_capture(call: Call, host: Host) -> Handled:
 
 
 def digicam(call: Call, host: Host) -> Handled:
-    """DO_DIGICAM_CONTROL: one photo when param 5 = 1 (ArduPilot's CAM1_TYPE=5 sends it).
-
-    Zoom, focus and session are ignored.
-    """
+    """DO_DIGICAM_CONTROL: one photo when param 5 = 1 (ArduPilot's CAM1_TYPE=5 sends it). Zoom,
+    focus and session are ignored."""
     host.camera.show_status()
     return host.camera.shoot() if call.param(5, 0.0) == 1.0 else Answer(Result.UNSUPPORTED)
 
@@ -194,10 +185,8 @@ def set_mode(call: Call, host: Host) -> Handled:
 
 
 def reboot(call: Call, host: Host) -> Handled | None:
-    """PREFLIGHT_REBOOT_SHUTDOWN of the companion; refused unless the vehicle is disarmed.
-
-    Param 2: 1 reboots, 2 shuts down; param 3 = 1 with param 4 = 191 restarts the service.
-    """
+    """PREFLIGHT_REBOOT_SHUTDOWN of the companion; refused unless the vehicle is disarmed. Param 2:
+    1 reboots, 2 shuts down; param 3 = 1 with param 4 = 191 restarts the service."""
     action = {1.0: Power.REBOOT, 2.0: Power.SHUT_DOWN}.get(call.param(2, 0.0))
     if action is None and call.param(3, 0.0) == 1.0 and call.param(4, 0.0) == ONBOARD:
         action = Power.RESTART_SERVICE
@@ -207,10 +196,8 @@ def reboot(call: Call, host: Host) -> Handled | None:
 
 
 def erase(call: Call, host: Host) -> Handled:
-    """STORAGE_FORMAT: erase the finished scans; refused while scanning or unless disarmed.
-
-    Param 1: storage (1, or 0 for all), param 2 = 1 erases, param 3 = 1 resets the count.
-    """
+    """STORAGE_FORMAT: erase the finished scans; refused while scanning or unless disarmed. Param 1:
+    storage (1, or 0 for all), param 2 = 1 erases, param 3 = 1 resets the count."""
     if call.param(1, 0.0) not in (0.0, 1.0) or call.param(2, 0.0) != 1.0:
         return Answer(Result.DENIED, "erase refused: needs storage 1, param 2 = 1")
 

@@ -159,10 +159,8 @@ class ScanControl(Protocol):
         return UNAVAILABLE
 
     def parameter_changed(self, name: str, value: float) -> Answer:
-        """Apply a new value of one of ``PARAMETERS``, or refuse it.
-
-        The baseline always arrives as ``SR_BASELINE_M`` (0: automatic), whatever command set it.
-        """
+        """Apply a new value of one of ``PARAMETERS``, or refuse it. The baseline always arrives as
+        ``SR_BASELINE_M`` (0: automatic), whatever command set it."""
         return UNAVAILABLE
 
 

@@ -32,10 +32,8 @@ SELECTOR = re.compile(r"^/?\[;comp=\d{1,3}\]")
 
 
 def file_uri(component: int, name: str) -> str:
-    """The address of a file of one of our components.
-
-    It names the component, because an autopilot may forward our messages as its own.
-    """
+    """The address of a file of one of our components. It names the component, because an autopilot
+    may forward our messages as its own."""
     return f"mftp://[;comp={component}]{name}"
 
 
@@ -63,10 +61,8 @@ def parse_request(payload: bytes) -> FtpRequest | None:
 
 
 class FileServer:
-    """Serves files by name; every answer is a full payload.
-
-    Where all sessions are open, a new one takes the place of the oldest of its client, or of all.
-    """
+    """Serves files by name; every answer is a full payload. Where all sessions are open, a new one
+    takes the place of the oldest of its client, or of all."""
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = dict(files)

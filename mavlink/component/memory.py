@@ -58,10 +58,8 @@ class Memory:
         streams: StreamTimes,
         system: int | None,
     ) -> None:
-        """Save what has changed; a full disk is logged, not raised.
-
-        A ``system`` of None keeps the known one.
-        """
+        """Save what has changed; a full disk is logged, not raised. A ``system`` of None keeps the
+        known one."""
         self._revision, self.system = revision, system or self.system
         self.parameters, self.signing_timestamp, self.signing_streams = values, timestamp, streams
         text = self._text()

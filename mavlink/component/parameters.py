@@ -144,10 +144,8 @@ class Parameters:
             self.change(parameter.name, parameter.default)
 
     def receive(self, message: Any) -> Answer | None:
-        """Handle a PARAM_* or PARAM_EXT_* message addressed to our component.
-
-        Returns the operator's answer for a message that sets a value, None for the rest.
-        """
+        """Handle a PARAM_* or PARAM_EXT_* message addressed to our component. Returns the
+        operator's answer for a message that sets a value, None for the rest."""
         kind, names = message.get_type(), list(self._table)
         send = partial(self._send, is_extended=kind.startswith("PARAM_EXT_"))
         if kind.endswith("_REQUEST_LIST"):

@@ -27,10 +27,8 @@ EMERGENCY, ALERT, CRITICAL, ERROR, WARNING, NOTICE, INFO, DEBUG = range(8)
 
 
 class StatusTexts:
-    """Texts to the operator: at most one a second, repetitions suppressed.
-
-    News come before answers, of which anybody may cause any number.
-    """
+    """Texts to the operator: at most one a second, repetitions suppressed. News come before
+    answers, of which anybody may cause any number."""
 
     def __init__(self, outbox: SendQueue) -> None:
         self._outbox = outbox

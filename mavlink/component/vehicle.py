@@ -193,10 +193,8 @@ class VehicleLink:
         self._inbox.put(lambda: self._companion.listen(name, listener))
 
     def report_odometry(self, odometry: BodyOdometry, time_ns: int) -> bool:
-        """Send our estimate to the autopilot, stamped with its clock at our monotonic time.
-
-        Returns False and sends nothing unless ``odometry`` is enabled and its clock is known.
-        """
+        """Send our estimate to the autopilot, stamped with its clock at our monotonic time. Returns
+        False and sends nothing unless ``odometry`` is enabled and its clock is known."""
         boot_us = self.boot_time_us(time_ns)
         if boot_us is None or not self.config.odometry:
             return False

@@ -251,10 +251,8 @@ EVERYONE = Address(0, 0)
 
 
 class TimesyncRequest(dialect.MAVLink_timesync_message):  # type: ignore[misc]
-    """A request to one component, so that routers need not forward it to others.
-
-    common.xml has its target fields, pymavlink's dialect has not.
-    """
+    """A request to one component, so that routers need not forward it to others. common.xml has its
+    target fields, pymavlink's dialect has not."""
 
     def __init__(self, ts1: int, target: Address) -> None:
         super().__init__(0, ts1)

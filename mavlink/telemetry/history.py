@@ -334,10 +334,8 @@ class VehicleHistory:
         return slerp(earth[0], earth[1], at.fraction)
 
     def _frame(self, key: tuple[int, int], claimed: GimbalFrame) -> GimbalFrame:
-        """The reference frame of the quaternion.
-
-        By configuration, else by the images, else as declared unless telemetry refutes it.
-        """
+        """The reference frame of the quaternion. By configuration, else by the images, else as
+        declared unless telemetry refutes it."""
         chosen = self.config.yaw_frame
         if chosen != "auto":
             return GimbalFrame(chosen)

@@ -84,10 +84,8 @@ class LatencyWatch:
         and the second frame, and ``q_camera(first)_camera(second)``."""
 
     def add(self, first_ns: int, second_ns: int, q_step: Quaternion) -> None:
-        """Add ``q_camera(first)_camera(second)`` between two frames, at their stamps.
-
-        Consecutive steps are joined. Invalid rotations and steps back in time are ignored.
-        """
+        """Add ``q_camera(first)_camera(second)`` between two frames, at their stamps. Consecutive
+        steps are joined. Invalid rotations and steps back in time are ignored."""
         step = normalised(q_step)
         if second_ns <= first_ns or step is None:
             return
@@ -333,10 +331,8 @@ class Attitudes:
         return grid
 
     def turns(self, start_s: F64, end_s: F64) -> tuple[F64, Bool]:
-        """((N, 3) rotation vectors in rad in the axes at the start, (N,) where known).
-
-        Times are seconds since ``base_ns``.
-        """
+        """((N, 3) rotation vectors in rad in the axes at the start, (N,) where known). Times are
+        seconds since ``base_ns``."""
         first, ok_first = self._at(start_s)
         second, ok_second = self._at(end_s)
         return rotation_vectors(first, second), ok_first & ok_second
@@ -354,9 +350,7 @@ class Attitudes:
 
 def _between(times_s: F64, q: F64, at_s: F64) -> tuple[F64, Bool]:
     """(N, 4) attitudes interpolated linearly between samples, and where samples are close enough.
-
-    For samples this close, linear interpolation equals slerp to a thousandth of the rotation.
-    """
+    For samples this close, linear interpolation equals slerp to a thousandth of the rotation."""
     i = np.clip(np.searchsorted(times_s, at_s, "right"), 1, len(times_s) - 1)
     gap = times_s[i] - times_s[i - 1]
     u = (at_s - times_s[i - 1]) / np.maximum(gap, 1e-9)
@@ -375,10 +369,8 @@ def rotation_vectors(first: F64, second: F64) -> F64:
 
 
 def best_rotation(source: F64, target: F64) -> F64:
-    """(3, 3) rotation R with ``target ~ R source`` for (N, 3) vectors.
-
-    Kabsch, DOI 10.1107/S0567739476001873.
-    """
+    """(3, 3) rotation R with ``target ~ R source`` for (N, 3) vectors. Kabsch, DOI
+    10.1107/S0567739476001873."""
     u, _, vt = np.linalg.svd(target.T @ source)
     turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
     return np.asarray(u @ turn @ vt)

@@ -83,10 +83,8 @@ def angle_between(a: Quaternion, b: Quaternion) -> float:
 
 
 def slerp(a: Quaternion, b: Quaternion, fraction: float) -> Quaternion:
-    """The rotation ``fraction`` of the way from a (0) to b (1) on the shorter arc.
-
-    Fractions slightly outside 0 to 1 extrapolate the rotation.
-    """
+    """The rotation ``fraction`` of the way from a (0) to b (1) on the shorter arc. Fractions
+    slightly outside 0 to 1 extrapolate the rotation."""
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     if dot < 0.0:
         b = (-b[0], -b[1], -b[2], -b[3])

@@ -109,10 +109,8 @@ class ReceiverAltitude:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleState:
-    """Attitude, gimbal attitude, position and height at ``time_ns``; a missing part is None.
-
-    Sigmas are 1 sigma and cover the time between samples; they are None with their part.
-    """
+    """Attitude, gimbal attitude, position and height at ``time_ns``; a missing part is None. Sigmas
+    are 1 sigma and cover the time between samples; they are None with their part."""
 
     time_ns: int  # the history's clock: companion monotonic live, unix in a replay
     q_ned_body_wxyz: F64 | None = None  # (4,) FRD body to NED

@@ -36,10 +36,8 @@ class Packet(NamedTuple):
 
 
 def packet_length(data: bytes | bytearray, at: int) -> int | None:
-    """Length in bytes of the packet that starts at ``at``; 0 when no packet can start there.
-
-    None when there are too few bytes to decide.
-    """
+    """Length in bytes of the packet that starts at ``at``; 0 when no packet can start there. None
+    when there are too few bytes to decide."""
     if at >= len(data):
         return None
     magic = data[at]

@@ -29,9 +29,7 @@ KEPT_WHILE_DOWN = 8  # messages kept for a link that is down; older ones are sta
 
 class Link:
     """A port that is reopened whenever it fails, with a reading and a writing thread.
-
-    ``on_data(data, monotonic_ns)`` is called in the reading thread for all received data.
-    """
+    ``on_data(data, monotonic_ns)`` is called in the reading thread for all received data."""
 
     def __init__(
         self, spec: LinkSpec, on_data: Callable[[bytes, int], None] = lambda data, now_ns: None

@@ -68,10 +68,8 @@ class Packer:
     def pack(
         self, system: int, outgoing: OutgoingMessage, unix_ns: int, ahead: int | None = None
     ) -> bytes | None:
-        """The packet; None when a value does not fit its field.
-
-        One that is packed ``ahead``, as after so many others, may never be sent.
-        """
+        """The packet; None when a value does not fit its field. One that is packed ``ahead``, as
+        after so many others, may never be sent."""
         with self._lock:
             key = (system, outgoing.component)
             encoder = self._encoders.get(key)

@@ -240,10 +240,8 @@ def _end(peer: socket.socket) -> None:
 
 
 def _ready(sockets: Sequence[socket.socket]) -> list[socket.socket]:
-    """Those with something to read within ``READ_S``.
-
-    Another thread may close one meanwhile, and unlike ``select`` its number may be any.
-    """
+    """Those with something to read within ``READ_S``. Another thread may close one meanwhile, and
+    unlike ``select`` its number may be any."""
     numbered = {n: one for one in sockets if (n := one.fileno()) >= 0}
     poll = select.poll()
     for number in numbered:

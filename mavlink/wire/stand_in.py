@@ -31,10 +31,8 @@ CLOSE_S = 2.0
 
 
 class StandIn:
-    """The process, until :meth:`close`. Use from one thread.
-
-    Where it cannot start, or ends, heartbeats are ours alone, and the log says so.
-    """
+    """The process, until :meth:`close`. Use from one thread. Where it cannot start, or ends,
+    heartbeats are ours alone, and the log says so."""
 
     def __init__(self, python: str = sys.executable) -> None:
         self._process: subprocess.Popen[bytes] | None = None

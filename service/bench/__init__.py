@@ -156,9 +156,7 @@ def keep(folder: Path, names: Sequence[str], report: dict[str, Any]) -> Path:
 
 def in_process(work: Callable[..., T], *given: object) -> T:
     """What ``work`` returns in a fresh interpreter, whose peak memory is not that of work before.
-
-    Raises OutsideError when that process is killed, as one that lacks memory is.
-    """
+    Raises OutsideError when that process is killed, as one that lacks memory is."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             return pool.submit(work, *given).result()

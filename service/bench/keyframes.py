@@ -28,10 +28,8 @@ def natural(h: int, w: int, slope: float, seed: int) -> F64:
 def make_keyframe(
     seq: int = 0, size_px: tuple[int, int] = (320, 180), fresh: Bool | None = None, seed: int = 1
 ) -> Keyframe:
-    """A nadir keyframe with depths from about 50 to 95 m; noise 2 cm white, 8 cm correlated.
-
-    At 320x180 the image makes about 14 KB of JPEG at quality 80, as aerial photographs do.
-    """
+    """A nadir keyframe with depths from about 50 to 95 m; noise 2 cm white, 8 cm correlated. At
+    320x180 the image makes about 14 KB of JPEG at quality 80, as aerial photographs do."""
     w, h = size_px
     rng = np.random.default_rng(seed + 1000 * seq)
     ground = 8.0 * natural(h, w, 2.2, seed)

@@ -108,9 +108,7 @@ class Direction:
 
 class LinkEmulator:
     """Relays ``listen_port`` to ``target_port`` of this machine through a :class:`LinkModel`.
-
-    :attr:`up` is the traffic from the side that calls, the drone.
-    """
+    :attr:`up` is the traffic from the side that calls, the drone."""
 
     def __init__(
         self,

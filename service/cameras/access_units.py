@@ -84,10 +84,8 @@ def access_units(
 
 
 def headed(packets: Iterator[av.Packet[Any]], codec: str) -> Iterator[av.Packet[Any]]:
-    """The packets, those that hold nothing of an image joined to the next one.
-
-    Some senders give the parameter sets of a key frame a packet of their own.
-    """
+    """The packets, those that hold nothing of an image joined to the next one. Some senders give
+    the parameter sets of a key frame a packet of their own."""
     import av
 
     is_vcl, head = IS_VCL.get(codec), b""

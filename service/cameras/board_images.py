@@ -102,10 +102,8 @@ def _video(path: Path, progress: Progress) -> Iterator[tuple[str, U8]]:
 
 
 def draw_coverage(calibration: Calibration, views: Sequence[BoardView]) -> U8:
-    """(h, w, 3) BGR image: all corners used, coloured by their view's rms, over the distortion.
-
-    The lines are a straight grid as distorted by the lens.
-    """
+    """(h, w, 3) BGR image: all corners used, coloured by their view's rms, over the distortion. The
+    lines are a straight grid as distorted by the lens."""
     W, H = calibration.camera.size_px
     scale = 1280.0 / W
     out = np.full((round(H * scale) + 60, 1280, 3), 28, np.uint8)

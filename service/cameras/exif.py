@@ -74,11 +74,8 @@ BROKEN = (
 
 
 def read_tags(path: Path, hemisphere: str = "") -> Tags:
-    """The tags of the image at ``path``; raises OSError when it is not an image, or when it
-    claims more pixels than any camera has.
-
-    ``hemisphere`` ("NW") is that of positions that state none.
-    """
+    """The tags of the image at ``path``; raises OSError when it is not an image, or when it claims
+    more pixels than any camera has. ``hemisphere`` ("NW") is that of positions that state none."""
     from PIL import Image
 
     try:
@@ -365,9 +362,7 @@ def _xmp_number(xmp: dict[str, str], *names: str) -> float | None:
 
 def _degrees(value: Any) -> tuple[float, float] | None:
     """Degrees of EXIF's degrees, minutes and seconds, and the finest step that they can state.
-
-    Seconds of 0/0 are none: the minutes have decimals, as a Nikon writes them.
-    """
+    Seconds of 0/0 are none: the minutes have decimals, as a Nikon writes them."""
     if not isinstance(value, tuple) or len(value) != 3:
         return None
     is_short = getattr(value[2], "numerator", 1) == getattr(value[2], "denominator", 1) == 0

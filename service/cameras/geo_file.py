@@ -33,10 +33,8 @@ def geo_file_of(folder: Path) -> Path | None:
 
 
 def read_geo(path: Path) -> dict[str, GeoTag]:
-    """Positions by the file names of stills, in lower case, with or without extension.
-
-    Raises InputError in one line, with its number, for anything that is wrong.
-    """
+    """Positions by the file names of stills, in lower case, with or without extension. Raises
+    InputError in one line, with its number, for anything that is wrong."""
     lines = read_small(path, LARGEST_BYTES, "file of positions").decode("utf-8-sig", "replace")
     head, *rows = lines.splitlines() or [""]
     with refusing(f"{path} line 1"):

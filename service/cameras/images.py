@@ -345,10 +345,8 @@ class ImagesSource(CameraSource):
         return without(tagged, lambda tag: True, is_yaw_known=False)
 
     def _places(self, tagged: list[Still], times_ns: list[int]) -> list[Still]:
-        """The stills without positions from which no aircraft reaches most of its flight in time.
-
-        A receiver that has just been switched on may say where it was last.
-        """
+        """The stills without positions from which no aircraft reaches most of its flight in time. A
+        receiver that has just been switched on may say where it was last."""
         from service.georeference import LocalFrame
 
         pairs = zip((tags.geotag for _, tags in tagged), times_ns, strict=True)
@@ -482,10 +480,8 @@ def by_camera(tagged: list[Still], name: Callable[[Tags], str]) -> dict[str, lis
 
 
 def widest(cameras: Mapping[str, list[Still]]) -> str:
-    """The camera that sees most, of those that took about as many shots as any.
-
-    Those with few pixels are thermal; without focal lengths the most pixels count.
-    """
+    """The camera that sees most, of those that took about as many shots as any. Those with few
+    pixels are thermal; without focal lengths the most pixels count."""
     moments = {
         name: len({tags.local_ns or tags.gps_unix_ns or path for path, tags in stills})
         for name, stills in cameras.items()
@@ -538,10 +534,8 @@ def utc_ns(tags: Tags, offset_ns: int | None) -> int | None:
 
 
 def spread(times_ns: list[int], tags: list[Tags]) -> list[int]:
-    """The same times, with stills within one whole second spread evenly over that second.
-
-    Some cameras state no more than whole seconds as fractions, too.
-    """
+    """The same times, with stills within one whole second spread evenly over that second. Some
+    cameras state no more than whole seconds as fractions, too."""
     same = Counter(times_ns)
     is_finer = any(tag.sub_second and (tag.local_ns or 0) % SECOND_NS for tag in tags)
     taken: Counter[int] = Counter()
@@ -570,9 +564,7 @@ def _deep(path: Path) -> Array | None:
 
 def _decoded(path: Path, flags: int) -> Array | None:
     """(H, W, 3) BGR as stored; None when the file does not decode. ``flags``: cv2.IMREAD_*.
-
-    MemoryError without memory for it, which is no fault of the file.
-    """
+    MemoryError without memory for it, which is no fault of the file."""
     import cv2
 
     try:
@@ -589,9 +581,7 @@ def _decoded(path: Path, flags: int) -> Array | None:
 
 def _ends(image: Array) -> F64:
     """(2,) the darkest and the brightest level of a deep image that are shown; NaN without any.
-
-    Infinity, as some write it where nothing is known, is no level.
-    """
+    Infinity, as some write it where nothing is known, is no level."""
     few = image[::4, ::4].astype(np.float64)
     known = few[np.isfinite(few)]
     return np.percentile(known, SHOWN) if known.size else np.full(2, np.nan)

@@ -156,10 +156,8 @@ def check_width(camera: Camera, what: str) -> None:
 def lens_of(
     photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
 ) -> Lens | None:
-    """The lens by a still's EXIF (``photo``) and XMP; None without lens tags.
-
-    ``size_px`` (W, H) is the still's current size, which may be smaller than the original.
-    """
+    """The lens by a still's EXIF (``photo``) and XMP; None without lens tags. ``size_px`` (W, H) is
+    the still's current size, which may be smaller than the original."""
     found = [
         _maker(photo, xmp, size_px),
         _pix4d(photo, xmp, size_px),

@@ -338,10 +338,8 @@ def open_rtmp_listen(rest: str, options: Mapping[str, str]) -> CameraSource:
 
 
 def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
-    """MPEG-TS by SRT: without a host it is waited for, ``srt://:9000``, else fetched.
-
-    GStreamer receives it: PyAV from PyPI comes without SRT.
-    """
+    """MPEG-TS by SRT: without a host it is waited for, ``srt://:9000``, else fetched. GStreamer
+    receives it: PyAV from PyPI comes without SRT."""
     reject_options("srt", options)
     place = re.fullmatch(r"//([^/\s:?@]*|\[[0-9a-fA-F:]+\]):(\d{1,5})(\?\S*)?", rest)
     if place is None or not 0 < int(place[2]) < 65536:
@@ -386,10 +384,8 @@ buffers into the stream (GStreamer 1.22), which then cannot be read."""
 
 
 def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
-    """Output of the GStreamer pipeline ``rest``.
-
-    The pipeline ends in raw video in system memory. Time stamps are those of arrival.
-    """
+    """Output of the GStreamer pipeline ``rest``. The pipeline ends in raw video in system memory.
+    Time stamps are those of arrival."""
     reject_options("gst", options)
     try:
         elements = [*shlex.split(rest), "!", *shlex.split(TAIL)]
@@ -421,10 +417,8 @@ OUTPUT_BYTES = 1 << 18
 
 
 class _Command:
-    """A command: its output as a file, its standard error in the log.
-
-    FFmpeg's own pipe waits for a silent command for ever.
-    """
+    """A command: its output as a file, its standard error in the log. FFmpeg's own pipe waits for a
+    silent command for ever."""
 
     def __init__(self, command: list[str]) -> None:
         pipe = subprocess.PIPE
@@ -460,10 +454,8 @@ class _Command:
 
 
 def open_command(command: list[str], stall_s: float, demuxer: dict[str, str]) -> Any:
-    """A container with the output of ``command``; closing it ends the command.
-
-    Raises OSError with the command's own complaint when it writes no video.
-    """
+    """A container with the output of ``command``; closing it ends the command. Raises OSError with
+    the command's own complaint when it writes no video."""
     import av
 
     running = _Command(command)

@@ -72,10 +72,8 @@ def turn_sigma_rad_s(gap_s: float, sigma_time_s: float = 0.0) -> float:
 
 
 class Rig:
-    """Turns vehicle states and image tags into priors on the camera's pose.
-
-    The scan's origin is the first known position; before it there are no positions.
-    """
+    """Turns vehicle states and image tags into priors on the camera's pose. The scan's origin is
+    the first known position; before it there are no positions."""
 
     def __init__(self, camera: CameraConfig, scan: ScanConfig, fusion: FusionConfig) -> None:
         self._camera, self._scan, self._fusion = camera, scan, fusion

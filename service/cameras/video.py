@@ -56,10 +56,8 @@ class VideoSource(CameraSource):
     def __init__(
         self, container: av.container.InputContainer, description: str, follows_turn: bool = False
     ) -> None:
-        """Take over ``container``; raises InputError when it has no image.
-
-        ``follows_turn`` rotates the images as the container requests.
-        """
+        """Take over ``container``; raises InputError when it has no image. ``follows_turn`` rotates
+        the images as the container requests."""
         super().__init__(description)
         self._container = container
         self._damaged = 0
@@ -374,10 +372,8 @@ def parse_time_unix_ns(text: str) -> int | None:
 
 
 def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:
-    """Presentation time of the stream's start as an exact fraction of seconds.
-
-    The first decodable image may be later than the start (a stream joined midway).
-    """
+    """Presentation time of the stream's start as an exact fraction of seconds. The first decodable
+    image may be later than the start (a stream joined midway)."""
     if stream.start_time is not None and stream.time_base is not None:
         start = stream.start_time * stream.time_base
         if first.pts is None or first.time_base is None or start <= first.pts * first.time_base:

@@ -53,11 +53,8 @@ def parser_of(handler: Handler) -> expat.XMLParserType:
 
 
 def xmp_values(packet: bytes) -> dict[str, str]:
-    """Values by name without prefix; elements of a list are joined by commas.
-
-    Of a packet that is no XML the part before the error counts; one with a document type is
-    not read.
-    """
+    """Values by name without prefix; elements of a list are joined by commas. Of a packet that is
+    no XML the part before the error counts; one with a document type is not read."""
     reader = _Reader()
     try:
         parser_of(reader).Parse(packet[:MAX_BYTES].decode("utf-8", "replace").encode(), True)

@@ -183,10 +183,8 @@ def fastest_backend(by: Choice) -> Backend:
 
 
 def named_backend(name: str, by: Choice) -> Backend:
-    """The backend called ``name``, ready to run.
-
-    Raises InputError when there is none of that name, OutsideError when it cannot run here.
-    """
+    """The backend called ``name``, ready to run. Raises InputError when there is none of that name,
+    OutsideError when it cannot run here."""
     if name == "onnx":
         raise InputError(
             "backend onnx runs a stereo model: give it with compute.model (stereo: --model); "

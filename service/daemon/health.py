@@ -61,11 +61,8 @@ class HealthServer(ThreadingHTTPServer):
 
 
 def _is_own(header: str | None, is_local: bool) -> bool:
-    """Whether a ``Host`` header names this machine; true without one (browsers send it).
-
-    A foreign site's name that resolves to this machine would let a browser read on behalf of that
-    site.
-    """
+    """Whether a ``Host`` header names this machine; true without one (browsers send it). A foreign
+    site's name that resolves to this machine would let a browser read on behalf of that site."""
     name = "localhost" if header is None else host_name(header)
     if is_local or is_loopback(name):
         return is_loopback(name)

@@ -100,11 +100,8 @@ class LandingWatch:
         close_after_s: float,
         now_s: float,
     ) -> Landing:
-        """Return the action at ``now_s`` of a monotonic clock.
-
-        ``is_disarmed`` is the autopilot's report, False where none is heard. A ``close_after_s`` of
-        0 never closes.
-        """
+        """Return the action at ``now_s`` of a monotonic clock. ``is_disarmed`` is the autopilot's
+        report, False where none is heard. A ``close_after_s`` of 0 never closes."""
         if is_armed or not wants_scan or close_after_s <= 0.0:
             self._has_flown = wants_scan and (is_armed or self._has_flown)
             self._landed_s = None

@@ -310,10 +310,8 @@ class Scanning:
         return None if run is None else run.work
 
     def end(self, wait: Callable[[], None] = lambda: None) -> None:
-        """Close the running scan, wait for all files, and start no other.
-
-        ``wait`` is called every second.
-        """
+        """Close the running scan, wait for all files, and start no other. ``wait`` is called every
+        second."""
         self.handle(Event.END)
         while workers := [w for run in self._runs for w in run.workers if not w.is_done]:
             wait()
@@ -341,10 +339,8 @@ class Scanning:
 
     @property
     def idle_closing_s(self) -> float:
-        """Seconds without progress in closing a scan; 0 while none is being closed.
-
-        Call it often: progress is any change since the last call.
-        """
+        """Seconds without progress in closing a scan; 0 while none is being closed. Call it often:
+        progress is any change since the last call."""
         runs, state, marks = self._live(), self.life.state, None
         if runs and (state.is_closing or state is State.ENDED):
             marks = [run.closing_marks() for run in runs]
@@ -365,10 +361,8 @@ class Scanning:
     # ---- changes in flight --------------------------------------------------------------------
 
     def configure(self, change: Callable[[Config], Config]) -> None:
-        """Change the configuration in one step; live keys also change in the running scan.
-
-        Raises what ``change`` raises; then nothing is changed.
-        """
+        """Change the configuration in one step; live keys also change in the running scan. Raises
+        what ``change`` raises; then nothing is changed."""
         with self._lock:
             self.config = change(self.config)
             self._apply()
@@ -571,10 +565,7 @@ class Scanning:
 
     def write_files(self, run: ScanRun, store: ScanStore) -> None:
         """Write a scan's files, and leave them to their worker when another scan is wanted
-        meanwhile.
-
-        Raises OutsideError when they cannot be written.
-        """
+        meanwhile. Raises OutsideError when they cannot be written."""
         folder, is_written, fault = store.path.parent, threading.Event(), ""
 
         def write(_: Worker) -> None:
@@ -628,10 +619,8 @@ def _report(
 
 
 def sizes(folder: Path) -> tuple[tuple[str, int], ...]:
-    """Name and bytes of each file that closing writes into a scan's folder.
-
-    The store and the link's log are left out, because others write them too.
-    """
+    """Name and bytes of each file that closing writes into a scan's folder. The store and the
+    link's log are left out, because others write them too."""
     with suppress(OSError):  # it is not there yet, or a file was renamed meanwhile
         files = (path for path in folder.iterdir() if not path.name.startswith(OTHERS))
         return tuple(sorted((path.name, path.stat().st_size) for path in files))

@@ -35,10 +35,8 @@ class SimulatedFlight:
     def __init__(
         self, source: str, render: Callable[[Path, dict[str, str]], None] | None = None
     ) -> None:
-        """The flight of a source ``sim:`` with its options, rendered if necessary.
-
-        InputError for invalid options.
-        """
+        """The flight of a source ``sim:`` with its options, rendered if necessary. InputError for
+        invalid options."""
         _, rest, options = parse_source(source)
         given = {"size": "640x360", "fps": "10", "duration_s": "30", "seed": "1"}
         reject_options("sim", options, tuple(given))

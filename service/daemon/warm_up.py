@@ -60,10 +60,8 @@ class SyntheticGround(CameraSource):
 
 
 def warm_up(config: Config, progress: Progress) -> tuple[float, int]:
-    """Scan the synthetic ground with the configured backend; returns (seconds, keyframes).
-
-    Writes the marker that :func:`is_warm` checks.
-    """
+    """Scan the synthetic ground with the configured backend; returns (seconds, keyframes). Writes
+    the marker that :func:`is_warm` checks."""
     from recon.backends.cpu import warm_up as warm_up_backend
     from recon.types import Camera
     from service.compute.backend_choice import open_backend
@@ -141,8 +139,6 @@ def _services_cache(prefix: str = sys.prefix) -> str:
 
 
 def _marker(folder: str) -> Path | None:
-    """Marker next to the kernels, one per installation: each version has its own kernels.
-
-    None for kernels next to the sources, where versions cannot be distinguished.
-    """
+    """Marker next to the kernels, one per installation: each version has its own kernels. None for
+    kernels next to the sources, where versions cannot be distinguished."""
     return Path(folder) / f"{MARKER}-{Path(sys.prefix).name}" if folder else None

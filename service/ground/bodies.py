@@ -33,9 +33,7 @@ class JSONResponse(StarletteJSONResponse):
 
 def changing(action: str, body: type[Body] | None = None) -> Callable[..., Callable[..., Any]]:
     """Makes an endpoint of ``work(request)`` or ``work(request, body)``, which runs on a thread.
-
-    The audit log gets the ``action`` and the scan, also where the body is refused.
-    """
+    The audit log gets the ``action`` and the scan, also where the body is refused."""
 
     def decorate(work: Callable[..., Response]) -> Callable[..., Any]:
         @wraps(work)

@@ -230,10 +230,8 @@ class DroneReceiver:
             self._rest(scan, str(error), now)
 
     def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
-        """Pause a scan that cannot be written; missing items are requested later.
-
-        One whose database was deleted is forgotten: the drone's next head begins it again.
-        """
+        """Pause a scan that cannot be written; missing items are requested later. One whose
+        database was deleted is forgotten: the drone's next head begins it again."""
         if trouble != scan.trouble:
             log.error("%s; trying again every %.0f s", trouble, self._limits.full_disk_rest_s)
         scan.trouble, scan.rest_until = trouble, now + self._limits.full_disk_rest_s

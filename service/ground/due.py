@@ -64,9 +64,7 @@ def write_files(
     folder: Path, deliver: Callable[[Path], None] = deliver, is_left: bool = False
 ) -> tuple[str, bool]:
     """Have ``deliver`` write a scan's files; what went wrong, and whether the disk refused one.
-
-    That stays due, whatever an earlier ``scan.json`` says; a fault in the scan would come again.
-    """
+    That stays due, whatever an earlier ``scan.json`` says; a fault in the scan would come again."""
     is_refused = False
 
     def work() -> None:

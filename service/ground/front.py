@@ -47,10 +47,8 @@ Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 class Front:
-    """Passes connections to an endpoint on to :attr:`inner`, with :meth:`run` on a worker.
-
-    Raises OutsideError when the address is not available.
-    """
+    """Passes connections to an endpoint on to :attr:`inner`, with :meth:`run` on a worker. Raises
+    OutsideError when the address is not available."""
 
     def __init__(self, endpoint: str) -> None:
         found = ENDPOINT.fullmatch(endpoint)
@@ -137,9 +135,7 @@ class Front:
 
 async def _exchange(outer: Stream, inner: Stream, admit: Callable[[], None]) -> bool:
     """Pass bytes both ways until an end closes; ``admit`` is called once Zenoh has admitted it.
-
-    Returns whether it has, or has refused it.
-    """
+    Returns whether it has, or has refused it."""
     replies, is_answered = 0, False
 
     async def inwards() -> None:

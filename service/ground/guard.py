@@ -104,10 +104,8 @@ class Tokens:
 
 
 def parse_tokens(text: str) -> dict[str, str]:
-    """Name to token of a token file: one ``TOKEN`` or ``NAME TOKEN`` per line.
-
-    Raises InputError for anything else and for a file without a token.
-    """
+    """Name to token of a token file: one ``TOKEN`` or ``NAME TOKEN`` per line. Raises InputError
+    for anything else and for a file without a token."""
     out: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
@@ -135,10 +133,8 @@ def read_tokens(path: Path) -> str:
 
 
 def kept_token(store: Path) -> str:
-    """The token kept in ``store`` (mode 600), made on the first call.
-
-    Raises OutsideError when it cannot be written there, InputError when it cannot be read.
-    """
+    """The token kept in ``store`` (mode 600), made on the first call. Raises OutsideError when it
+    cannot be written there, InputError when it cannot be read."""
     path = store / TOKEN_FILE
     if not path.exists():
         with writing(path) as part:
@@ -185,10 +181,8 @@ class AuditLog:
 
 
 class Pace:
-    """A token bucket: ``burst`` at once, then ``rate_hz`` a second.
-
-    Not slowapi: it limits routes by address, not orders, refusals and warnings in the log.
-    """
+    """A token bucket: ``burst`` at once, then ``rate_hz`` a second. Not slowapi: it limits routes
+    by address, not orders, refusals and warnings in the log."""
 
     def __init__(
         self, rate_hz: float, burst: int, clock: Callable[[], float] = time.monotonic
@@ -239,9 +233,7 @@ class _StalledError(Exception):
 
 class RequestLimits:
     """The outermost ASGI layer: bounds every request and marks it as served at the listener.
-
-    Starlette's own limit counts bytes only; a body or a reader that is slow without end is ours.
-    """
+    Starlette's own limit counts bytes only; a body or a reader that is slow without end is ours."""
 
     def __init__(
         self, app: ASGIApp, listener: BoundedListener, body_s: float, stall_s: float

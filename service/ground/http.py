@@ -174,10 +174,8 @@ def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
 
 
 def _description(routes: list[Any]) -> dict[str, Any]:
-    """The routes as an OpenAPI document, from docstrings and bodies.
-
-    Starlette's generator wants the same once more, as YAML in docstrings.
-    """
+    """The routes as an OpenAPI document, from docstrings and bodies. Starlette's generator wants
+    the same once more, as YAML in docstrings."""
     _, schemas = msgspec.json.schema_components(
         BODIES.values(), ref_template="#/components/schemas/{name}"
     )
@@ -455,10 +453,8 @@ def _order(request: Request, order: VehicleOrder) -> Response:
 
 
 def _metrics(request: Request) -> Response:
-    """The receiver's figures in the text form of Prometheus.
-
-    Not prometheus_client: two figures that another thread counts take as many lines with it.
-    """
+    """The receiver's figures in the text form of Prometheus. Not prometheus_client: two figures
+    that another thread counts take as many lines with it."""
     lines = ["# TYPE skyrelief_received_bytes counter", "# TYPE skyrelief_keyframes gauge"]
     for entry in state_of(request).progress():
         labels = f'{{drone="{_quoted(entry["drone"])}",scan="{_quoted(entry["scan"])}"}}'

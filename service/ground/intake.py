@@ -143,10 +143,8 @@ class ScanIntake:
         self.head, self.head_at = head, now
 
     def on_items(self, message: bytes, now: float) -> bool:
-        """Parts of records; True when something new was stored that is part of the scan.
-
-        Raises OutsideError when the disk is full; the records will be asked for again.
-        """
+        """Parts of records; True when something new was stored that is part of the scan. Raises
+        OutsideError when the disk is full; the records will be asked for again."""
         self.received_bytes += len(message)
         news = False
         for part in parse(message):

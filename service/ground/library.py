@@ -227,9 +227,7 @@ class Library:
 
     def take(self, source: Path) -> tuple[str, str]:
         """Import a scan folder, as it lay on the aircraft's disk, or an MCAP; its drone and scan.
-
-        Raises InputError when it is none or the library has that scan already.
-        """
+        Raises InputError when it is none or the library has that scan already."""
         with workplace(self.store) as place:
             part = place / "scan"
             part.mkdir(0o750)

@@ -52,10 +52,8 @@ MAX_REASON_BYTES = 123  # of a WebSocket's close frame
 
 
 def chunk_message(store: ScanStore, seq: int, layer: int) -> bytes | None:
-    """A layer of a keyframe as a binary message; None when there is nothing to decode.
-
-    What does not decode, tiles of the narrow radio, and depth in JPEG-LS are coded again.
-    """
+    """A layer of a keyframe as a binary message; None when there is nothing to decode. What does
+    not decode, tiles of the narrow radio, and depth in JPEG-LS are coded again."""
     data = store.chunk(seq, layer) or b""
     opened = codec.unpack(data)
     if (

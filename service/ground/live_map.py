@@ -135,9 +135,7 @@ class LiveMap:
 
     def surface(self, tile: Tile, seen: bool = False) -> Raster:
         """The measured part of a tile, (WIDE, WIDE) with its margin, at a zoom up to :attr:`zoom`.
-
-        With ``seen`` all that images show between, at height 0.
-        """
+        With ``seen`` all that images show between, at height 0."""
         drawn = self._tiles.pop(tile, None) or _Drawn()
         now = dict(self._within(tile))
         if any(now.get(seq) != state for seq, state in drawn.states.items()):

@@ -174,10 +174,8 @@ class SiteNews:
         self._seen = 0
 
     def message(self) -> str | None:
-        """What the process wrote last, as JSON; None when it is known already.
-
-        ``T`` (16, column by column) takes a scan's coordinates, corrected, to this scan's.
-        """
+        """What the process wrote last, as JSON; None when it is known already. ``T`` (16, column by
+        column) takes a scan's coordinates, corrected, to this scan's."""
         try:
             written = self._path.lstat().st_mtime_ns
         except OSError:

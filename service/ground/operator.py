@@ -192,10 +192,8 @@ class Operator:
     def subscribe(
         self, name: str, callback: Callable[[int, dict[str, Any]], None]
     ) -> Callable[[], None]:
-        """Call back with (component, fields) for every message of a name; "" is all.
-
-        Returns what ends the subscription.
-        """
+        """Call back with (component, fields) for every message of a name; "" is all. Returns what
+        ends the subscription."""
 
         def on_message(message: Any, _: Any = None) -> None:
             callback(message.component_id, parse_fields(message.fields_json))

@@ -122,10 +122,8 @@ class Drone:
 
 
 class Receiver:
-    """Receives on threads of its own between :meth:`start` and :meth:`close`.
-
-    Raises InputError for endpoints or a store that cannot be used.
-    """
+    """Receives on threads of its own between :meth:`start` and :meth:`close`. Raises InputError for
+    endpoints or a store that cannot be used."""
 
     def __init__(
         self,
@@ -365,10 +363,8 @@ class Receiver:
     # Effects
 
     def _perform(self, one: Drone, effect: drone.Effect) -> None:
-        """Carry out what a drone's worker has decided; what follows is put into it.
-
-        Without a session nothing is sent: what it was for is due again.
-        """
+        """Carry out what a drone's worker has decided; what follows is put into it. Without a
+        session nothing is sent: what it was for is due again."""
         session, high = self._session, zenoh.Priority.INTERACTIVE_HIGH
         match effect:
             case drone.Write():

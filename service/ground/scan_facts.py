@@ -104,10 +104,8 @@ class Labels(msgspec.Struct, frozen=True):
 
 
 def facts_of(folder: Path) -> dict[str, Any]:
-    """A scan's entry in the list, from its ``scan.json`` or else its store.
-
-    Raises InputError for a file that cannot be read, ValueError for an unfit store.
-    """
+    """A scan's entry in the list, from its ``scan.json`` or else its store. Raises InputError for a
+    file that cannot be read, ValueError for an unfit store."""
     if (folder / SUMMARY).exists():
         return _of_summary(folder / SUMMARY, Facts).shown()
     with ScanStore.peek(folder / "scan.db") as store:

@@ -185,10 +185,8 @@ class Jobs:
         return any(job.state == "running" or job.may_begin is None for job in of_it)
 
     def cancel(self, number: int) -> dict[str, Any]:
-        """Take a waiting job off the queue, or stop a running one at its next step.
-
-        InputError when there is none of this number, or it has ended.
-        """
+        """Take a waiting job off the queue, or stop a running one at its next step. InputError when
+        there is none of this number, or it has ended."""
         with self._lock:
             found = [j for j in self._jobs if j.number == number and not j.has_ended]
             if not found:
@@ -278,10 +276,8 @@ class OpenScans(Generic[V]):
         self._kept: OrderedDict[Path, tuple[V, ScanStore, float]] = OrderedDict()
 
     def view(self, folder: Path) -> V:
-        """The view of the scan in ``folder``. Hold :attr:`lock` while it is used.
-
-        Raises InputError when the folder contains no scan, and what the view raises.
-        """
+        """The view of the scan in ``folder``. Hold :attr:`lock` while it is used. Raises InputError
+        when the folder contains no scan, and what the view raises."""
         with self.lock:
             if folder not in self._kept:
                 self._kept[folder] = self._opened(folder)

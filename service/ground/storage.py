@@ -57,10 +57,8 @@ class DroneLimits:
 
 
 class DiskShare:
-    """Space that one drone may still use; use from one thread.
-
-    Everything in the drone's folder counts: coarse layers, poses and deliverables too.
-    """
+    """Space that one drone may still use; use from one thread. Everything in the drone's folder
+    counts: coarse layers, poses and deliverables too."""
 
     def __init__(self, folder: Path, limits: DroneLimits) -> None:
         self._folder, self._limits = folder, limits
@@ -68,10 +66,8 @@ class DiskShare:
         self._total_bytes, self._free_bytes, self._looked_at = 0, 0, -1e9
 
     def check(self, size_bytes: int, now: float | None = None) -> None:
-        """Count ``size_bytes`` that are about to be written.
-
-        Raises OutsideError when they do not fit into the share, or would take from the reserve.
-        """
+        """Count ``size_bytes`` that are about to be written. Raises OutsideError when they do not
+        fit into the share, or would take from the reserve."""
         now = time.monotonic() if now is None else now
         self._look(now)
         share, reserve_bytes = self._limits.drone_share, self._limits.reserve_bytes
@@ -158,10 +154,8 @@ def scan_folder(store: Path, drone: str, name: str) -> Path:
 
 
 def run_folder(drone: Path, scan: str, identity: tuple[str, str, str]) -> Path:
-    """The folder in ``drone`` of the scan with that identity; ``scan`` is what it is called.
-
-    Raises InputError when there are MAX_RUNS of others already.
-    """
+    """The folder in ``drone`` of the scan with that identity; ``scan`` is what it is called. Raises
+    InputError when there are MAX_RUNS of others already."""
     places = [drone / scan, *(drone / f"{scan}-{n}" for n in range(2, MAX_RUNS + 1))]
     free = [place for place in places if not (place / "scan.db").exists()]
     for place in places:

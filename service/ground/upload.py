@@ -175,10 +175,8 @@ class Upload:
 
 
 def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
-    """Make the scan folder ``out`` of a video and perhaps a log and a camera model.
-
-    Raises InputError with the process's last line when it fails.
-    """
+    """Make the scan folder ``out`` of a video and perhaps a log and a camera model. Raises
+    InputError with the process's last line when it fails."""
     of = {PARTS[path.suffix]: path for path in paths}
     command = python_command("service.cli", "replay", str(of.pop("video")))
     command += [word for option, path in of.items() for word in (option, str(path))]

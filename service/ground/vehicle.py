@@ -26,11 +26,8 @@ HEARD = ("SYS_STATUS", "GPS_RAW_INT", "VFR_HUD", "ATTITUDE", "GLOBAL_POSITION_IN
 
 
 class Vehicle:
-    """Looks for a companion on a MAVLink endpoint, on a thread of its own.
-
-    ``connect`` makes the :class:`service.ground.operator.Operator`; it raises OutsideError
-    while none is connected.
-    """
+    """Looks for a companion on a MAVLink endpoint, on a thread of its own. ``connect`` makes the
+    :class:`service.ground.operator.Operator`; it raises OutsideError while none is connected."""
 
     def __init__(
         self,

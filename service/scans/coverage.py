@@ -180,10 +180,8 @@ class LiveCoverage:
 
 
 def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | None:
-    """The layer of everything in ``store``; None without any surface.
-
-    Cells of ``cell_m``; by default about four pixels of the first keyframe's depth image.
-    """
+    """The layer of everything in ``store``; None without any surface. Cells of ``cell_m``; by
+    default about four pixels of the first keyframe's depth image."""
     return LiveCoverage(store, cell_m).refresh()
 
 
@@ -198,10 +196,8 @@ def write_coverage_files(folder: Path, live: LiveCoverage) -> Coverage | None:
 
 @contextmanager
 def covering(store: ScanStore, every_s: float = WRITE_EVERY_S) -> Iterator[None]:
-    """Write coverage.png and coverage.json of the growing scan, on a separate thread.
-
-    Disk failures are logged and retried.
-    """
+    """Write coverage.png and coverage.json of the growing scan, on a separate thread. Disk failures
+    are logged and retried."""
     live = LiveCoverage(store)
 
     def write() -> None:

@@ -353,10 +353,8 @@ def save_debug(folder: Path, seq: int, arrays: Mapping[str, Array]) -> Path:
 
 
 def load_debug(path: Path) -> dict[str, Array] | None:
-    """The arrays of STAGES in ``path``; None when there is no such file.
-
-    Raises InputError when the file was not written by ``save_debug``.
-    """
+    """The arrays of STAGES in ``path``; None when there is no such file. Raises InputError when the
+    file was not written by ``save_debug``."""
     if not path.is_file():
         return None
     try:

@@ -336,10 +336,8 @@ def resolution_m(header: ScanHeader) -> float | None:
 
 
 def surface(fused: FusedCloud, cell_m: float | None = None) -> Raster | None:
-    """The upper surface in the scan's own ENU metres, or None without points.
-
-    Cells are by default as of :func:`preview_cell_m`.
-    """
+    """The upper surface in the scan's own ENU metres, or None without points. Cells are by default
+    as of :func:`preview_cell_m`."""
     if not len(fused.cloud):
         return None
     xy = fused.cloud.xyz_m[:, :2]

@@ -157,10 +157,8 @@ def _points(keyframe: Keyframe, box: Box) -> PointCloud:
 
 
 def strip_edges(extents: Iterable[Extent], max_points: int) -> list[float]:
-    """Edges in x, from -inf to inf, of strips with at most about ``max_points`` each.
-
-    A keyframe's points are assumed to be evenly spread over its width.
-    """
+    """Edges in x, from -inf to inf, of strips with at most about ``max_points`` each. A keyframe's
+    points are assumed to be evenly spread over its width."""
     widths = [(e.box[0], e.box[2], e.points) for e in extents]
     ends = [(west, points / max(east - west, 1e-3)) for west, east, points in widths]
     ends += [(east, -points / max(east - west, 1e-3)) for west, east, points in widths]
@@ -209,10 +207,8 @@ def placed(cloud: PointCloud, frame: LocalFrame | None) -> F64:
 
 
 def las_wkt(epsg: int, vertical: str | None) -> str:
-    """What :func:`service.georeference.map_crs` gives, as LAS 1.4 asks for it: in WKT 1.
-
-    Only ellipsoidal heights are in WKT 2, as WKT 1 has none on a map.
-    """
+    """What :func:`service.georeference.map_crs` gives, as LAS 1.4 asks for it: in WKT 1. Only
+    ellipsoidal heights are in WKT 2, as WKT 1 has none on a map."""
     version = "WKT2_2019" if vertical == "ellipsoid" else "WKT1_GDAL"
     return map_crs(epsg, vertical).to_wkt(version)
 
@@ -221,9 +217,7 @@ def las_header(
     xyz_m: F64, frame: LocalFrame | None, started_unix_ns: int, vertical: str | None = None
 ) -> laspy.LasHeader:
     """The header for points near ``xyz_m``; its dates come from the scan, not from the clock.
-
-    ``vertical`` is what :func:`service.georeference.map_crs` takes.
-    """
+    ``vertical`` is what :func:`service.georeference.map_crs` takes."""
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=7)

@@ -296,9 +296,7 @@ def _pixel_m(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> float | No
 
 def overlaps(K: F64, size_px: tuple[int, int], poses: Sequence[PoseRecord]) -> list[float]:
     """Share of the ground in each keyframe's image that the one before shows too, on level ground.
-
-    Images that reach to the horizon are left out.
-    """
+    Images that reach to the horizon are left out."""
     w, h = size_px
     corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]) - 0.5
     prints = []

@@ -72,10 +72,8 @@ def make_room(
     keep: Container[str] = (),
     free: Callable[[Path], int] = free_bytes,
 ) -> list[str]:
-    """Delete the oldest finished scans until ``keep_free_mib`` are free; returns their names.
-
-    Scans in ``keep`` and open ones stay.
-    """
+    """Delete the oldest finished scans until ``keep_free_mib`` are free; returns their names. Scans
+    in ``keep`` and open ones stay."""
     deleted: list[str] = []
     if keep_free_mib <= 0 or not folder.is_dir():
         return deleted
@@ -110,10 +108,8 @@ class Claim:
         self._held: int | None = None
 
     def take(self, folder: Path) -> bool:
-        """Make the folder and claim it; False when another process has it.
-
-        Where folders cannot be locked, every claim succeeds.
-        """
+        """Make the folder and claim it; False when another process has it. Where folders cannot be
+        locked, every claim succeeds."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
             held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -235,10 +235,8 @@ def _number(document: Any, key: str) -> float | None:
 
 
 def slope_deg(xyz_m: Array) -> float:
-    """The angle in degrees between the plane through points (N, 3) and the horizontal.
-
-    0 for fewer than three points.
-    """
+    """The angle in degrees between the plane through points (N, 3) and the horizontal. 0 for fewer
+    than three points."""
     if len(xyz_m) < 3:
         return 0.0
     normal, _ = plane_through(xyz_m[:: max(1, len(xyz_m) // 20_000)].astype(np.float64))

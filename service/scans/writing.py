@@ -21,10 +21,7 @@ SUMMARY = "scan.json"
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
     """A temporary path of the calling thread for ``path``; renamed onto it on success, and on the
-    disk then, otherwise removed.
-
-    A disk failure becomes an OutsideError.
-    """
+    disk then, otherwise removed. A disk failure becomes an OutsideError."""
     with _beside(path) as part:
         yield part
         sync(part)
@@ -33,10 +30,8 @@ def writing(path: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Write a file, or the names in a folder, through to the disk; OSError when it fails.
-
-    Some network file systems cannot do so for a folder: there the names are written when they are.
-    """
+    """Write a file, or the names in a folder, through to the disk; OSError when it fails. Some
+    network file systems cannot do so for a folder: there the names are written when they are."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -56,10 +51,7 @@ def write_whole(path: Path, data: bytes | str) -> None:
 @contextmanager
 def writing_folder(path: Path) -> Iterator[Path]:
     """An empty folder next to ``path``, renamed onto it on success. An existing folder is replaced
-    only then.
-
-    A disk failure becomes an OutsideError.
-    """
+    only then. A disk failure becomes an OutsideError."""
     with _beside(path) as part:
         part.mkdir()
         yield part
@@ -71,10 +63,7 @@ def writing_folder(path: Path) -> Iterator[Path]:
 @contextmanager
 def filling_folder(path: Path) -> Iterator[Path]:
     """An empty folder inside the folder ``path``, whose content moves there on success; otherwise
-    nothing of it stays.
-
-    A disk failure becomes an OutsideError.
-    """
+    nothing of it stays. A disk failure becomes an OutsideError."""
     is_new = not path.exists()
     try:
         with _beside(path / "new") as part:
@@ -90,9 +79,7 @@ def filling_folder(path: Path) -> Iterator[Path]:
 
 def check_writable(path: Path, is_folder: bool = False) -> None:
     """Raise InputError, before any work, where no file (or folder) can be written at ``path``.
-
-    OutsideError where rights are missing.
-    """
+    OutsideError where rights are missing."""
     if path.exists() and path.is_dir() != is_folder:
         raise InputError(f"{path} is a {'file' if is_folder else 'folder'}; give another --out")
     there = existing(path if path.is_dir() else path.parent)
@@ -146,10 +133,8 @@ def _remove(part: Path) -> None:
 
 
 def files_due(folder: Path) -> bool:
-    """Whether the files of a finished scan must still be written, or retried.
-
-    scan.json is written last; it records whether the disk refused another file.
-    """
+    """Whether the files of a finished scan must still be written, or retried. scan.json is written
+    last; it records whether the disk refused another file."""
     try:
         document = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

@@ -120,11 +120,8 @@ def play(
 
 
 def _play_once(video: Path, tlog: Path, url: str, loop: bool, player: MavlinkPlayer) -> int:
-    """Play once from the start; returns the number of frames.
-
-    In a loop without the telemetry before and after the video: a camera that is silent for
-    seconds counts as lost.
-    """
+    """Play once from the start; returns the number of frames. In a loop without the telemetry
+    before and after the video: a camera that is silent for seconds counts as lost."""
     frames = 0
     try:
         with (

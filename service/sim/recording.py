@@ -114,9 +114,7 @@ class SimulationOptions:
     @property
     def started_unix_s(self) -> int:
         """Time of the first frame; another one for each flight of a place, the second date later.
-
-        Two scans that begin at the same time and place count as one flight.
-        """
+        Two scans that begin at the same time and place count as one flight."""
         flight_s = FLIGHT_S * ((self.own_seed - self.seed) % FLIGHTS)
         return EPOCH_UNIX_S + FLIGHT_S * FLIGHTS * (self.date - 1) + flight_s
 
@@ -153,10 +151,8 @@ class Simulation:
         return self.renderer.develop(light / np.float32(1 + len(others)), index, look)
 
     def _poses_while_open(self, index: int) -> list[F64]:
-        """Poses of frame ``index``, evenly over its exposure and about a pixel apart.
-
-        Each is (4, 4), or has one of each row (N, 4, 4) of a rolling shutter.
-        """
+        """Poses of frame ``index``, evenly over its exposure and about a pixel apart. Each is (4,
+        4), or has one of each row (N, 4, 4) of a rolling shutter."""
         open_s = self.options.exposure_s
         moments = int(np.clip(np.ceil(self._pixels_per_s(index) * open_s), 1, MAX_MOMENTS))
         offsets = open_s * ((np.arange(moments) + 0.5) / moments - 0.5)
@@ -181,10 +177,8 @@ class Simulation:
         return self.flight.T_world_camera(time_s + row_times_s(camera))
 
     def surface_range(self, origins: F64, directions: F64) -> F64:
-        """(N,) metres from (N, 3) places along (N, 3) unit directions to the first surface.
-
-        Outside the scene it is the terrain's, for directions that lead downwards.
-        """
+        """(N,) metres from (N, 3) places along (N, 3) unit directions to the first surface. Outside
+        the scene it is the terrain's, for directions that lead downwards."""
         met, _ = self.scene.grid.cast(origins, directions)
         outside = np.zeros(len(origins))
         for _ in range(TERRAIN_STEPS):

@@ -27,10 +27,8 @@ SKY = (225.0, 205.0, 185.0)
 
 
 def camera_rays(camera: Camera) -> F64:
-    """(H, W, 3) ray with z = 1 of every pixel of the distorted image, in the camera frame.
-
-    Raises ValueError when the lens model cannot be inverted over the whole image.
-    """
+    """(H, W, 3) ray with z = 1 of every pixel of the distorted image, in the camera frame. Raises
+    ValueError when the lens model cannot be inverted over the whole image."""
     check_camera(camera)
     W, H = camera.size_px
     u, v = np.meshgrid(np.arange(W, dtype=np.float64), np.arange(H, dtype=np.float64))
@@ -155,10 +153,8 @@ def _turned(R, a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _seen(place, R, c, a, b, pixel):  # type: ignore[no-untyped-def]
-    """(b, g, r, t, body) along the ray (a, b, 1); ``pixel`` is the angle of a pixel in rad.
-
-    ``t`` counts in lengths of the direction; body 0 is the ground, -1 the sky.
-    """
+    """(b, g, r, t, body) along the ray (a, b, 1); ``pixel`` is the angle of a pixel in rad. ``t``
+    counts in lengths of the direction; body 0 is the ground, -1 the sky."""
     grid, normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun = place
     dx, dy, dz = _turned(R, a, b)
     t, m = first_hit(grid, c[0], c[1], c[2], dx, dy, dz)

@@ -68,10 +68,8 @@ class ChangedBox:
 def make(
     area: Area, relief_m: float, density: float, seed: int, changes: int = 0, date: int = 1
 ) -> Scene:
-    """The place of ``seed`` over ``area``; ``density`` 1 is a village, 0 is open country.
-
-    Of ``changes`` boxes the first half stands at ``date`` 1 only, the others at ``date`` 2.
-    """
+    """The place of ``seed`` over ``area``; ``density`` 1 is a village, 0 is open country. Of
+    ``changes`` boxes the first half stands at ``date`` 1 only, the others at ``date`` 2."""
     layout = _Layout(area, relief_m, density, seed)
     layout.add_houses()
     layout.add_cars()

@@ -54,10 +54,8 @@ def score(
     say: Callable[[str], object] = lambda text: None,
     near_track_m: float = 40.0,
 ) -> dict[str, Any]:
-    """All figures of a scan against the truth, ready for JSON; InputError for missing parts.
-
-    Ground within ``near_track_m`` of the ground track counts apart, too.
-    """
+    """All figures of a scan against the truth, ready for JSON; InputError for missing parts. Ground
+    within ``near_track_m`` of the ground track counts apart, too."""
     say("reading the truth and the scan")
     truth = read_truth(truth_folder)
     scan = read_scan(scan_folder, truth.frame)
@@ -132,9 +130,7 @@ def _surface_part(scan: ScanResult, sigma_m: F32 | None, truth: Truth, fit: Fit)
 
 def _dsm(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
     """The certain surface of the cloud against the truth's height at each cell's middle.
-
-    ``known_share`` is that of the cells with any point; a step is a metre within a cell.
-    """
+    ``known_share`` is that of the cells with any point; a step is a metre within a cell."""
     points = fit.points(scan.points)
     sigma = np.full(len(points), 0.1, np.float32) if scan.sigma_m is None else scan.sigma_m
     grid = grid_over(points[:, :2], DSM_CELL_M, margin_cells=1)

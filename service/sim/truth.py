@@ -157,9 +157,7 @@ def write_surface(path: Path, vertices: F64, triangles: I32) -> None:
 
 def read_surface(path: Path) -> tuple[F64, I32]:
     """(vertices (N, 3), triangles (M, 3)) of a PLY file of the form of :func:`write_surface`.
-
-    Coordinates may be float or double. InputError, in one line, for anything else.
-    """
+    Coordinates may be float or double. InputError, in one line, for anything else."""
     with reading(path):
         data = path.read_bytes()
         head = HEADER.match(data)

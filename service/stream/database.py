@@ -233,10 +233,8 @@ class Database:
         return 0 if row is None else int(row[0]), self._connection.total_changes
 
     def write(self, statements: list[Statement]) -> int:
-        """Run statements in one transaction; returns the number of changed rows.
-
-        Raises OutsideError when the disk is full or fails; then nothing is changed.
-        """
+        """Run statements in one transaction; returns the number of changed rows. Raises
+        OutsideError when the disk is full or fails; then nothing is changed."""
         with self.lock:
             self._start()
             before = self._connection.total_changes
@@ -287,10 +285,8 @@ TABLES = ("meta", "chunks", "poses", "reposes", "radio", "held")
 
 
 def is_sound(path: Path) -> bool:
-    """Whether SQLite finds no fault in the file; a busy file counts as sound.
-
-    Raises InputError when its schema is not that of a scan.
-    """
+    """Whether SQLite finds no fault in the file; a busy file counts as sound. Raises InputError
+    when its schema is not that of a scan."""
     try:
         with closing(connect(path, read_only=not can_write(path))[0]) as connection:
             check_schema(connection, path)

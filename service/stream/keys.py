@@ -145,18 +145,14 @@ def tls_files(folder: Path) -> tuple[str, str, str]:
 
 
 def expiry_unix_s(certificate: Path) -> float:
-    """Expiry of a certificate (PEM), unix s; InputError for any other file.
-
-    Raises OutsideError without the ``cryptography`` package.
-    """
+    """Expiry of a certificate (PEM), unix s; InputError for any other file. Raises OutsideError
+    without the ``cryptography`` package."""
     return _read(certificate).not_valid_after_utc.timestamp()
 
 
 def member_name(certificate: Path) -> str:
-    """Name of the member in a certificate (PEM); InputError for any other file.
-
-    Raises OutsideError without the ``cryptography`` package.
-    """
+    """Name of the member in a certificate (PEM); InputError for any other file. Raises OutsideError
+    without the ``cryptography`` package."""
     read = _read(certificate)
     from cryptography.x509.oid import NameOID
 
@@ -312,9 +308,7 @@ def _signed(
     authority: Authority | None = None,
 ) -> Authority:
     """A new certificate and its key, written into ``home``; the first extension is critical.
-
-    Without an ``authority`` it is one, signed by its own key.
-    """
+    Without an ``authority`` it is one, signed by its own key."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec

@@ -141,10 +141,8 @@ class DatalinkSender:
     # The scan's side
 
     def add(self, store: ScanStore, owned: bool = False) -> None:
-        """Offer another scan of this drone too, such as one that the ground still lacks.
-
-        An ``owned`` store is closed with the sender.
-        """
+        """Offer another scan of this drone too, such as one that the ground still lacks. An
+        ``owned`` store is closed with the sender."""
         scan_id = check_name(store.header.name, "scan")
 
         def on_item(kind: str, number: int) -> None:
@@ -398,10 +396,8 @@ def _rate(budget_kbit_s: float, share: float) -> float:
 
 
 def sessions(config: DatalinkConfig) -> list[SessionConfig]:
-    """A client for each endpoint to connect to, and a router where others connect to us.
-
-    Raises InputError for encrypted endpoints to listen on, and as :func:`check_endpoints`.
-    """
+    """A client for each endpoint to connect to, and a router where others connect to us. Raises
+    InputError for encrypted endpoints to listen on, and as :func:`check_endpoints`."""
     for endpoint in config.listen:
         if is_encrypted(endpoint):
             raise InputError(

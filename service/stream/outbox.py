@@ -330,10 +330,8 @@ class Outbox:
     def on_ask(
         self, scan_id: str, kind: str, numbers: RangeSet, ask: Ask, token: Any, now: float
     ) -> list[Any]:
-        """A ground station requests items; returns the tokens of requests that this ends.
-
-        A request replaces the station's previous one in its lane.
-        """
+        """A ground station requests items; returns the tokens of requests that this ends. A request
+        replaces the station's previous one in its lane."""
         feed = self._feeds.get(scan_id)
         if feed is None or kind not in CODES or not self._hear(ask.peer, now):
             return [token]
@@ -373,10 +371,8 @@ class Outbox:
     # Output
 
     def next(self, now: float, sessions: int = 1) -> Outgoing | float:
-        """The message to send now, or the seconds to wait; any event may shorten the wait.
-
-        A live message goes over the link once for each of the ``sessions``, an answer once.
-        """
+        """The message to send now, or the seconds to wait; any event may shorten the wait. A live
+        message goes over the link once for each of the ``sessions``, an answer once."""
         if not self.listened(now):
             self._clear_live()
         part_bytes = self.bucket.part_bytes

@@ -181,10 +181,8 @@ def _guess(c: I64, k: I64, i: int, row: int, base: int, w: I64) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple[F64, F64]:
-    """Weighted sums of the fit over every ``step``-th pixel; smooth surroundings weigh more.
-
-    The sums are the lower triangle of a symmetric matrix.
-    """
+    """Weighted sums of the fit over every ``step``-th pixel; smooth surroundings weigh more. The
+    sums are the lower triangle of a symmetric matrix."""
     h, w = size
     row = w + 2 * MARGIN
     A = np.zeros((9, 9))
@@ -210,10 +208,8 @@ def _normal_equations(c: I64, k: I64, size: tuple[int, int], step: int) -> tuple
 
 @numba.njit(cache=True, nogil=True)
 def _residuals(c: F64, k: F64, size: tuple[int, int], weights: I64) -> U16:
-    """Zigzag residuals of the known pixels in scan order.
-
-    The predictions of a row are computed at once in float64, where these integers are exact.
-    """
+    """Zigzag residuals of the known pixels in scan order. The predictions of a row are computed at
+    once in float64, where these integers are exact."""
     h, w = size
     row = w + 2 * MARGIN
     f = weights.astype(np.float64)

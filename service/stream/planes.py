@@ -94,10 +94,8 @@ def _fill_back(values: Array, known: Bool) -> Array:
 
 
 def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
-    """Codes of inverse depth, and the inverse depth of code 0 and the step, in 1/m.
-
-    Codes of unknown pixels are arbitrary. The step grows when 65536 codes are too few.
-    """
+    """Codes of inverse depth, and the inverse depth of code 0 and the step, in 1/m. Codes of
+    unknown pixels are arbitrary. The step grows when 65536 codes are too few."""
     depth, known = planes.depth_m, planes.known
     if known.all():
         near, far = float(depth.min()), float(depth.max())

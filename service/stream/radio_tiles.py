@@ -100,10 +100,8 @@ class RadioStore:
         self._db = database
 
     def add(self, kind: str, number: int, part: int, data: bytes) -> bool:
-        """Store a message ("tile" or "pose"), the newest of its number; False if already known.
-
-        A tile is of a keyframe that is done: it ends a first depth up to that one.
-        """
+        """Store a message ("tile" or "pose"), the newest of its number; False if already known. A
+        tile is of a keyframe that is done: it ends a first depth up to that one."""
         with self._db.lock:
             sql = "SELECT 1 FROM radio WHERE kind = ? AND number = ? AND part = ? AND data = ?"
             if self._db.one(sql, (kind, number, part, data)) is not None:

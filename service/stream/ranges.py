@@ -33,9 +33,7 @@ def chunk_kind(layer: int) -> str:
 
 class RangeSet:
     """A set of numbers up to :data:`MAX_NUMBER`, as sorted ranges that neither overlap nor touch.
-
-    Sixteen bytes each: a scan of hours has one for every keyframe.
-    """
+    Sixteen bytes each: a scan of hours has one for every keyframe."""
 
     __slots__ = ("_edges",)
 

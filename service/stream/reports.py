@@ -72,10 +72,8 @@ KEEP_S = 10.0
 
 
 class Reports:
-    """Reports queued for the datalink's next turn. :meth:`put` is thread-safe.
-
-    However many arrive, only a few are processed per turn.
-    """
+    """Reports queued for the datalink's next turn. :meth:`put` is thread-safe. However many arrive,
+    only a few are processed per turn."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox

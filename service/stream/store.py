@@ -135,10 +135,8 @@ class ScanStore:
 
     @classmethod
     def peek(cls, path: Path) -> ScanStore:
-        """An existing store, read without looking for damage, which reads the whole file.
-
-        Raises InputError when it contains no scan, OutsideError when it cannot be read.
-        """
+        """An existing store, read without looking for damage, which reads the whole file. Raises
+        InputError when it contains no scan, OutsideError when it cannot be read."""
         return cls(path, None, None, read_only=True)
 
     def close(self) -> None:
@@ -184,9 +182,7 @@ class ScanStore:
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Close the scan with its ``summary`` of plain values; non-finite numbers become null.
-
-        Raises ValueError for a summary that receivers would reject.
-        """
+        Raises ValueError for a summary that receivers would reject."""
         strict = json.loads(json.dumps(summary), parse_constant=lambda _: None)
         data = json.dumps(strict, sort_keys=True).encode()
         if summary_from_json(data) is None:
@@ -252,10 +248,8 @@ class ScanStore:
         return data if data is not None and codec.is_image(data) else None
 
     def keyframe(self, seq: int) -> Keyframe | None:
-        """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
-
-        Without a layer, the tiles of the narrow radio or the first depth are used.
-        """
+        """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied. Without a
+        layer, the tiles of the narrow radio or the first depth are used."""
         decoded = self.keyframe_as_sent(seq)
         repose = self.repose(seq)
         return decoded if decoded is None or repose is None else repose.applied_to(decoded)
@@ -330,10 +324,8 @@ class ScanStore:
         return self.add_poses([pose])
 
     def add_poses(self, poses: Sequence[PoseRecord]) -> int:
-        """Store several poses in one transaction; returns the first number.
-
-        Those that receivers would reject are left out.
-        """
+        """Store several poses in one transaction; returns the first number. Those that receivers
+        would reject are left out."""
         packed = [(pose, pack_pose(pose)) for pose in poses]
         packed = [row for row in packed if unpack_pose(row[1]) is not None]
         with self._lock:
@@ -368,10 +360,8 @@ class ScanStore:
         return sorted(newest_at.values(), key=lambda pose: pose.time_unix_ns)
 
     def poses_beside(self, known: RangeSet) -> Iterator[tuple[int, PoseRecord]]:
-        """Number and pose of those whose numbers are not ``known``; adds them to it.
-
-        Of the gaps in ``known``, the newest MAX_RANGES are read.
-        """
+        """Number and pose of those whose numbers are not ``known``; adds them to it. Of the gaps in
+        ``known``, the newest MAX_RANGES are read."""
         sql = "SELECT id, data FROM poses WHERE id BETWEEN ? AND ?"
         for gap in (RangeSet([(0, MAX_NUMBER)]) - known).pairs():
             for number, data in self.database.all(sql, gap):
@@ -395,10 +385,8 @@ class ScanStore:
     # For the link
 
     def record(self, kind: str, number: int) -> bytes | None:
-        """The stored bytes of item ``number`` of a kind of :mod:`service.stream.messages`.
-
-        Header and summary are numbered by the CRC-32 of their JSON, so that changes are visible.
-        """
+        """The stored bytes of item ``number`` of a kind of :mod:`service.stream.messages`. Header
+        and summary are numbered by the CRC-32 of their JSON, so that changes are visible."""
         if kind in ("header", "summary"):
             text = self.database.get(kind)
             data = b"" if text is None else text.encode()

@@ -141,10 +141,8 @@ def _messages(path: Path, counts: Counter[str]) -> Iterator[Any]:
 def _turning(
     attitudes: list[tuple[AttitudeSample, float]], rates: list[tuple[float, ...]]
 ) -> Iterator[tuple[AttitudeSample, float]]:
-    """Attitudes and their times in s, with the body's rates where they are known.
-
-    ``rates`` are rows of time in s and rad/s about three axes.
-    """
+    """Attitudes and their times in s, with the body's rates where they are known. ``rates`` are
+    rows of time in s and rad/s about three axes."""
     table = np.array(rates).reshape(-1, 4)
     table = table[(np.abs(table[:, 1:]) <= MAX_RATE_RAD_S).all(axis=1)]
     times = np.array([time_s for _, time_s in attitudes])

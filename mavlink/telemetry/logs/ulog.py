@@ -150,11 +150,8 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
 
 
 class _LimitedFile(io.BufferedReader):
-    """A file with a limit on the bytes read.
-
-    pyulog seeks back over a damaged message. Where the file is truncated within it, pyulog seeks
-    too far back and would read the same bytes forever.
-    """
+    """A file with a limit on the bytes read. pyulog seeks back over a damaged message. Where the
+    file is truncated within it, pyulog seeks too far back and would read the same bytes forever."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
