@@ -79,6 +79,7 @@ ROWS: tuple[Row, ...] = (
     Row("radio", "the coarse scan over a telemetry radio, both ends", 4, restarts=True,
         is_essential=True),
     Row("self-test", "camera and disk, on command", 5),
+    Row("stop", "waits for the disk, so that no power cut brings a stopped scan back", 5),
     Row("erase", "deletes finished scans, on command", 5),
     Row("recover", "closes what a crash left open", 5),
     Row("housekeeping", "watches the machine, its memory and its disk", 5),

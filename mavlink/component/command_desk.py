@@ -118,7 +118,8 @@ class CommandDesk:
         self._outbox = outbox
         self._host = host
         self._say = say
-        self._running: dict[tuple[int, int], _Running] = {}  # (component, number)
+        # By component, number and, of stops, source: each who stops gets the result.
+        self._running: dict[tuple[int, int, Address | None], _Running] = {}
         self._last: _Done | None = None  # shared: both components act on one scan
 
     def receive(self, call: Call, components: tuple[int, ...], now_ns: int) -> None:
@@ -138,8 +139,10 @@ class CommandDesk:
 
     def _carry_out(self, component: int, command: Command, call: Call, now_ns: int) -> None:
         key = (component, *_key(call))
-        running = self._running.get((component, call.number))
         is_stop = self._is_stop(call)
+        slot = component, call.number, call.source if is_stop else None
+        same = [at for at in self._running if at[:2] == slot[:2] and (at == slot or not is_stop)]
+        running = self._running[same[0]] if same else None
         if running is not None and not is_stop:
             self._answer_while(running, component, call, key)
             return
@@ -156,8 +159,11 @@ class CommandDesk:
         elif isinstance(handled, Work):
             window_ns = int(command.window_s * S)
             limit_ns, report_ns = now_ns + WORK_LIMIT_NS, now_ns + PROGRESS_EVERY_NS
-            running = _Running(call, key, window_ns, handled, limit_ns, report_ns)
-            self._start(component, running, now_ns)
+            self._last = None
+            self._running[slot] = _Running(call, key, window_ns, handled, limit_ns, report_ns)
+            if handled.answer is None:
+                self._progress(component, call, handled)
+            self.tick(now_ns)
         else:
             self._answer(component, call, handled)
             self._remember(key, handled, now_ns, int(command.window_s * S))
@@ -180,33 +186,24 @@ class CommandDesk:
         if window_ns:
             self._last = _Done(key, answer, now_ns + window_ns)
 
-    def _start(self, component: int, running: _Running, now_ns: int) -> None:
-        call, work = running.call, running.work
-        self._last = None
-        self._running[(component, call.number)] = running
-        if work.answer is None:
-            self._progress(component, call, work)
+    def cancel(self, number: int, now_ns: int) -> None:
+        """Cancel running work of this number."""
+        for running in self._running.values():
+            if running.call.number == number:
+                running.work.cancel()
         self.tick(now_ns)
-
-    def cancel(self, number: int, source: Address, now_ns: int) -> bool:
-        """Cancel running work of this number; True when there was some."""
-        found = [r for (_, n), r in self._running.items() if n == number]
-        for running in found:
-            running.work.cancel()
-        self.tick(now_ns)
-        return bool(found)
 
     def tick(self, now_ns: int) -> None:
         """Report progress and final results of running work."""
-        for (component, number), running in list(self._running.items()):
-            answer = running.work.answer
+        for slot, running in list(self._running.items()):
+            component, answer = slot[0], running.work.answer
             if isinstance(answer, Work):
                 running.work, answer = answer, None
             if answer is None and now_ns >= running.until_ns:
                 running.work.cancel()
                 answer = Answer(Result.FAILED, "timed out")
             if answer is not None:
-                del self._running[(component, number)]
+                del self._running[slot]
                 if running.work.cancelled and answer.result is Result.ACCEPTED:
                     answer = Answer(Result.CANCELLED)
                 self._answer(component, running.call, answer)

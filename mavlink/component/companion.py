@@ -187,7 +187,7 @@ class Companion:
         payload = payload.ljust(4, b"\0")
         number = payload[0] | payload[1] << 8
         if self._is_for_us(Address(payload[2], payload[3])):
-            self.desk.cancel(number, Address(packet.system, packet.component), now_ns)
+            self.desk.cancel(number, now_ns)
 
     def _hear_parameter(self, message: Any, name: str) -> None:
         target = getattr(message, "target_system", None)

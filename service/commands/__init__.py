@@ -89,11 +89,12 @@ def one_of(action: str, actions: Sequence[str], command: str) -> None:
         raise InputError(f"{command} {action}: there are {', '.join(actions)}")
 
 
-def check_names(chosen: "Config", where: str) -> None:
+def check_names(chosen: "Config", path: Path | None) -> None:
     """Raise InputError for a link, camera or backend that no machine can open."""
     from mavlink.wire.ports import parse_link
     from service.cameras import parse_source
 
+    where = "configuration" if path is None else path
     try:
         for link in chosen.mavlink.links:
             parse_link(link)

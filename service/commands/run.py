@@ -97,7 +97,7 @@ def reread(
     with _reloads:
         try:
             wanted = load_config(path, overrides)
-            check_names(wanted, f"{path}")
+            check_names(wanted, path)
             daemon.reload(wanted if flight is None else flight.configured(wanted))
         except InputError as error:
             log.error("the configuration is unchanged: %s", error)

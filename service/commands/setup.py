@@ -44,7 +44,7 @@ def config(
         raise InputError("config check: name the file to check")
     chosen = load_config(file, set_ or [])
     if action == "check":
-        check_names(chosen, f"{file}")
+        check_names(chosen, file)
     values = chosen.to_dict()
     if action == "show":
         values = public_configuration(values)

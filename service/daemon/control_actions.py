@@ -106,12 +106,11 @@ class ControlActions:
             return Answer(text="Scan starts when the previous one is closed")
         return ACCEPTED
 
-    def stop_scan(self) -> Answer:
-        self._scanning.handle(Event.STOP)
-        return ACCEPTED
+    def stop_scan(self) -> Work:
+        return self._scanning.stop()
 
-    def finalise(self) -> Handled:
-        return self._scanning.finalise() or ACCEPTED
+    def finalise(self) -> Work:
+        return self._scanning.finalise()
 
     def pause(self) -> Handled:
         is_wanted = self._scanning.handle(Event.PAUSE).is_wanted

@@ -7,6 +7,7 @@ service or the computer crashed; its text identifies the boot of the computer.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from enum import Enum, auto
 from pathlib import Path
 
@@ -51,13 +52,18 @@ class Resumption:
             log.warning("a restart in flight will not resume the scan: %s", error)
 
     def forget(self) -> None:
-        """Remove the mark: no scan runs, or none need resume."""
+        """Remove the mark: no scan runs, or none need resume. :meth:`settle` follows."""
         self.left = Left.NOTHING
+        self._change(lambda: self._path.unlink(missing_ok=True))
+
+    def settle(self) -> None:
+        """Wait for the disk: else a power cut within seconds of a stop brings the mark back."""
+        if self._path.parent.exists():
+            self._change(lambda: sync(self._path.parent))
+
+    def _change(self, work: Callable[[], object]) -> None:
         try:
-            self._path.unlink()
-            sync(self._path.parent)  # or a power cut within seconds of a stop brings the mark back
-        except FileNotFoundError:
-            pass
+            work()
         except OSError as error:
             log.warning("%s cannot be removed: %s", self._path, error.strerror)
 
@@ -69,6 +75,7 @@ class Resumption:
         """
         if self.left is Left.BY_COMPUTER and is_heard and not is_armed:
             self.forget()
+            self.settle()
         return self.left is Left.BY_SERVICE or (self.left is Left.BY_COMPUTER and is_armed)
 
     def _boot(self) -> str:

@@ -335,9 +335,10 @@ class Daemon:
         is_armed = presence.is_armed and presence.is_certain
         was_armed, self._was_armed = self._was_armed, is_armed
         if scan.start == "on-arm" and is_armed != was_armed:
-            answer = (self.actions.start_scan if is_armed else self.actions.stop_scan)()
-            if answer.text:
-                self.vehicle.statustext(answer.text, NOTICE)
+            if not is_armed:
+                self.actions.stop_scan()
+            elif text := self.actions.start_scan().text:
+                self.vehicle.statustext(text, NOTICE)
         if scan.start == "on-command":
             is_heard = presence.autopilot is not None and presence.is_certain
             if self.scanning.start_again(is_heard, is_armed):

@@ -261,6 +261,8 @@ class Scanning:
             scan.source.close()  # wakes it where the camera is dead; may take long
         if unused is not None:
             unused.close()
+        if Effect.UNMARK in effects and event is not Event.STOP:  # :meth:`stop` waits elsewhere
+            self.resumption.settle()
         return before
 
     def _take_following(self) -> CameraSource | None:
@@ -300,14 +302,26 @@ class Scanning:
                 self.start()
             return is_due
 
-    def finalise(self) -> Work | None:
-        """Stop; returns the work of writing everything, or None when nothing runs."""
+    def stop(self) -> Work:
+        """Drop the wanted scan; the work ends once no power cut can bring it back."""
+        self.handle(Event.STOP)
+        work = Work()
+
+        def settle(_: Worker) -> None:
+            self.resumption.settle()
+            work.finish()
+
+        self._workers.start("stop", settle)
+        return work
+
+    def finalise(self) -> Work:
+        """Stop; the work ends once everything is written."""
         with self._lock:
             run = self.run
             if run is not None:
                 run.work = run.work or Work()
-        self.handle(Event.STOP)
-        return None if run is None else run.work
+        stopped = self.stop()
+        return stopped if run is None or run.work is None else run.work
 
     def end(self, wait: Callable[[], None] = lambda: None) -> None:
         """Close the running scan, wait for all files, and start no other. ``wait`` is called every
@@ -410,6 +424,8 @@ class Scanning:
         self._end_run(run, fault)
 
     def _end_run(self, run: ScanRun, fault: str) -> None:
+        if run.work is not None:
+            self.resumption.settle()
         with self._lock:
             if fault:
                 self.fault = fault

@@ -191,7 +191,14 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
         ],
         REJECTED: [refused("start_scan", REJECTED, plain(2500, CAMERA))],
     },
-    2501: {ACCEPTED: [plain(2501, CAMERA), during(SCANNING, plain(2501, CAMERA))]},
+    2501: {
+        ACCEPTED: [
+            plain(2501, CAMERA),
+            during(SCANNING, plain(2501, CAMERA)),
+            worked("stop_scan", "ends", 2501, CAMERA),
+        ],
+        RUNNING: [worked("stop_scan", "runs", 2501, CAMERA)],
+    },
     2000: {
         ACCEPTED: [plain(2000, CAMERA, 0, 0, 1, 7), plain(2000, CAMERA, 0, 1, 5)],
         REJECTED: [refused("capture_keyframe", REJECTED, plain(2000, CAMERA, 0, 0, 1, 7))],
@@ -209,6 +216,7 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
     },
     200: {
         ACCEPTED: [plain(200, CAMERA, 0, 0, 0, 1), plain(200, CAMERA, 0, 0, 0, 0)],
+        RUNNING: [worked("stop_scan", "runs", 200, CAMERA, 0, 0, 0, 0)],
         REJECTED: [refused("start_scan", REJECTED, plain(200, CAMERA, 0, 0, 0, 1))],
         DENIED: [plain(200, CAMERA, 0, 0, 0, 9)],
     },
@@ -239,6 +247,7 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
         RUNNING: [
             worked("finalise", "runs", 31010, ONBOARD, 5),
             worked("self_test", "runs", 31010, ONBOARD, 6),
+            worked("stop_scan", "runs", 31010, ONBOARD, 8),
         ],
         REJECTED: [
             plain(31010, ONBOARD, 1),
@@ -301,7 +310,7 @@ def documented() -> dict[int, set[Result]]:
         numbers = re.findall(r"`[A-Z0-9_]+` (\d+)", cells[0]) if len(cells) == 4 else []
         for number in numbers:
             results = {ACCEPTED}
-            for part in cells[3].replace(" (5, 6)", "").split(";"):
+            for part in cells[3].replace(" (5, 6, 8)", "").split(";"):
                 name = part.partition(":")[0].strip().upper().replace(" ", "_")
                 results |= {Result[name]} if name else set()
             found[int(number)] = results

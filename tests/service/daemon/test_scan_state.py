@@ -25,7 +25,7 @@ from hypothesis.stateful import (
 from loopback import until
 from onboard import FakeCamera, Onboard
 
-from mavlink.component.control import Phase, Result, Work
+from mavlink.component.control import Answer, Phase, Result, Work
 from mavlink.component.presence import Health
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
@@ -184,6 +184,34 @@ def test_a_stop_forgets_a_scan_to_resume(tmp_path: Path) -> None:
     daemon.vehicle.arm()
     daemon.look()
     assert not begun and daemon.scanning.phase is Phase.IDLE
+
+
+class StalledDisk(Resumption):
+    """Its folder is on the disk once :attr:`goes_on` is set."""
+
+    goes_on: threading.Event
+
+    def settle(self) -> None:
+        self.goes_on.wait(60.0)
+        super().settle()
+
+
+@pytest.mark.parametrize("finalise", [False, True])
+def test_a_stop_is_accepted_once_the_disk_has_it_and_holds_nobody_up(
+    finalise: bool, tmp_path: Path
+) -> None:
+    resumption = StalledDisk(tmp_path)
+    resumption.goes_on = threading.Event()
+    begun = list[ScanRun]()
+    daemon = Onboard(tmp_path, script=begun.append, resumption=resumption)
+    daemon.actions.is_ready = True
+    daemon.actions.start_scan()
+    work = daemon.actions.finalise() if finalise else daemon.actions.stop_scan()
+    until(lambda: begun)
+    assert work.answer is None and not (tmp_path / MARK).exists()
+    resumption.goes_on.set()
+    until(lambda: work.answer)
+    assert isinstance(work.answer, Answer) and work.answer.result is Result.ACCEPTED
 
 
 # ---- a pause, a photo, a text --------------------------------------------------------------------
@@ -427,8 +455,7 @@ class AnyOrder(RuleBasedStateMachine):
     def stop(self, finalise: bool) -> None:
         actions = self.daemon.actions
         answer = actions.finalise() if finalise else actions.stop_scan()
-        assert isinstance(answer, Work) == (finalise and self.run is not None)
-        if isinstance(answer, Work):
+        if finalise and self.run is not None:
             self.works.append(answer)
         self.wanted, self.is_left = "nothing", False
         assert self.run is None or self.run.stop.is_set()

@@ -241,6 +241,11 @@ def test_a_reload_that_no_restart_could_use_changes_nothing(
     assert not daemon.reload.called and f"unchanged: {path}: " in caplog.text
 
 
+def test_a_reload_without_a_file_names_the_configuration(caplog: pytest.LogCaptureFixture) -> None:
+    reread(Mock(), None, None, ["camera.source=rstp://a/b"])
+    assert "unchanged: configuration: " in caplog.text
+
+
 def test_of_two_reloads_the_newest_file_counts(tmp_path: Path) -> None:
     """Each runs on a thread of its own: the earlier one put its older file in force last."""
     path, in_force = tmp_path / "sr.toml", list[float]()
