@@ -138,8 +138,9 @@ def _asset(path: Path, role: str) -> dict[str, Any]:
 
 MAPS = ("laz", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "geojson", "kml",
         "kmz", "stac")  # fmt: skip
-FROM_IMAGES = ("ortho", "kmz")
-"""Made at the same time as the others, in this order: kmz uses the orthophoto."""
+FROM_IMAGES = ("ortho", "kmz", "splat")
+"""Made at the same time as the others, in this order: kmz uses the orthophoto, and most of a mesh's
+steps keep one core busy."""
 LAST = ("stac", "report")
 """What describes the others."""
 
