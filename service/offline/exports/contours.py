@@ -123,11 +123,11 @@ def _in_utm(frame: LocalFrame, coordinates: Spot | Sequence[Spot]) -> F64:
 
 
 def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """3D polylines of DXF R12 in UTM metres; a layer per height, index lines in red, and a layer
-    with their labels."""
+    """3D polylines of DXF R12 in UTM metres: a layer of index lines, in red, one of their labels
+    and one of the others."""
     rows = ["0", "SECTION", "2", "ENTITIES"]
     for one in contours_of(scan, options):
-        layer = f"CONTOUR_{one.height_m:g}".replace("-", "M").replace(".", "_")
+        layer = "CONTOUR_INDEX" if one.is_index else "CONTOUR"
         rows += ["0", "POLYLINE", "8", layer, "62", "1" if one.is_index else "7"]
         rows += ["66", "1", "70", "8", "10", "0", "20", "0", "30", "0"]
         for place in one.places.tolist():
