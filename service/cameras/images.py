@@ -132,13 +132,13 @@ class ImagesSource(CameraSource):
             return None
         image = _deep(path)
         if image is not None and image.dtype != np.uint8:
-            image = self._eight_bits(image, path)
+            image = self._eight_bits(image)
         if image is None:
             return None
         back = -(self._turned_deg(tags) // 90)
         return np.ascontiguousarray(np.rot90(image, back), dtype=np.uint8)
 
-    def _eight_bits(self, image: Array, path: Path) -> Array | None:
+    def _eight_bits(self, image: Array) -> Array:
         """A deep image in 8 bits: of all levels, or of those that the stills have."""
         import cv2
 
@@ -148,12 +148,13 @@ class ImagesSource(CameraSource):
             self._black_white = low, high = black_and_white(ends)
             if not self._is_photo(image):
                 self._warn(f"levels of the images from {low:.5g} to {high:.5g} are black to white")
-        if self._is_photo(image):
-            return _decoded(path, cv2.IMREAD_COLOR)
         low, high = self._black_white
-        with np.errstate(over="ignore", invalid="ignore"):  # foreign floats may be any
-            share = (image.astype(np.float32) - low) * (255.0 / (high - low))
-        shown = np.nan_to_num(share).clip(0.0, 255.0).astype(np.uint8)
+        if self._is_photo(image):
+            shown = (image >> 8).astype(np.uint8)
+        else:
+            with np.errstate(over="ignore", invalid="ignore"):  # foreign floats may be any
+                share = (image.astype(np.float32) - low) * (255.0 / (high - low))
+            shown = np.nan_to_num(share).clip(0.0, 255.0).astype(np.uint8)
         return shown if shown.ndim == 3 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR))
 
     def _is_photo(self, image: Array) -> bool:
