@@ -110,7 +110,6 @@ class AutopilotLink:
         self._say(texts.WARNING, "Autopilot restarted; telemetry starts over")
 
     def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
-        """Answer the autopilot's request, or process an answer to ours."""
         is_autopilot = (packet.system, packet.component) == self._presence.autopilot
         if message.tc1 == 0:  # a request: answer with our own time since boot
             reply = dialect.MAVLink_timesync_message(now_ns, message.ts1)
@@ -196,7 +195,6 @@ class RateKeeper:
         self._looked_ns: int | None = None
 
     def heard(self, name: str) -> None:
-        """Count a message of the autopilot."""
         want = self._wants.get(name)
         if want is not None:
             want.heard += 1

@@ -222,7 +222,6 @@ class Companion:
     # Output.
 
     def take(self) -> list[OutgoingMessage]:
-        """Messages to send now, in order."""
         return self._outbox.take()
 
     def tick(self, now_ns: int) -> None:

@@ -46,7 +46,6 @@ class Work:
         self.cancelled = False
 
     def report(self, fraction: float) -> None:
-        """Report progress, 0 to 1."""
         self.fraction = min(1.0, max(0.0, fraction))
 
     def finish(self, answer: Handled = ACCEPTED) -> None:
@@ -140,7 +139,6 @@ class ScanControl(Protocol):
         return UNAVAILABLE
 
     def clear_map(self) -> Handled:
-        """Forget the map of the running scan."""
         return UNAVAILABLE
 
     def finalise(self) -> Handled:

@@ -53,7 +53,6 @@ class FtpRequest:
 
 
 def parse_request(payload: bytes) -> FtpRequest | None:
-    """The request in a payload; None for any other payload."""
     if len(payload) < HEAD.size:
         return None
     sequence, session, opcode, size, _, _, _, offset = HEAD.unpack_from(payload)

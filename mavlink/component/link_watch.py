@@ -100,7 +100,6 @@ class LinkWatch:
             self._asked_ns = now_ns if is_ours else self._asked_ns
 
     def restart(self, now_ns: int) -> None:
-        """Wait for the messages of an autopilot that has just started."""
         self._since_ns = now_ns
 
     def troubles(self, now_ns: int) -> tuple[Trouble, ...]:

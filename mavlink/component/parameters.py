@@ -96,7 +96,6 @@ class Parameters:
 
     @property
     def table(self) -> tuple[Parameter, ...]:
-        """Every parameter with its current default."""
         return tuple(self._table.values())
 
     def __getitem__(self, name: str) -> float:

@@ -108,7 +108,6 @@ class Presence:
         self._news: list[str] = []
 
     def take_news(self) -> list[str]:
-        """New messages for the operator, each once."""
         news, self._news = self._news, []
         return news
 
@@ -251,7 +250,6 @@ class Presence:
             known.messages += 1
 
     def answered(self, system: int, component: int, round_trip_ns: int) -> None:
-        """Process an answer to one of our TIMESYNC requests."""
         known = self._heard.get(system)
         if known is None or known.component != component:
             return

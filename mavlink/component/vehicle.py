@@ -240,7 +240,6 @@ class VehicleLink:
         return self._clock_ns() - self._alive_ns < STUCK_NS
 
     def report(self) -> VehicleReport:
-        """A snapshot for health pages and ``doctor``."""
         seen = self.presence.autopilot_seen_ns
         round_trip = self._companion.autopilot.timesync.round_trip_ns
         return VehicleReport(

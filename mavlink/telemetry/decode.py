@@ -129,7 +129,6 @@ def _altitude(m: Message) -> Sample | None:
 
 
 def _device_status(m: Any) -> GimbalSample | None:
-    """The sample in a GIMBAL_DEVICE_ATTITUDE_STATUS (285)."""
     q = normalised(m.q)
     if q is None:
         return None

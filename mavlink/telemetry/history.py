@@ -231,7 +231,6 @@ class VehicleHistory:
             self._seen = frame
 
     def clear(self) -> None:
-        """Discard everything, as after a reboot of the autopilot."""
         with self._lock:
             for track in self._tracks.values():
                 track.clear()

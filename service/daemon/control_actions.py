@@ -97,7 +97,6 @@ class ControlActions:
         return camera_view(self._scanning.config.camera, camera, state)
 
     def start_scan(self) -> Answer:
-        """Start a scan, once a scan that is being closed permits it."""
         if not self.is_ready:
             return Answer(Result.TEMPORARILY_REJECTED, "still starting")
         is_closing = self._scanning.life.state.is_closing
@@ -198,7 +197,6 @@ class ControlActions:
 
 
 def _systemctl(verb: str) -> Answer:
-    """Ask the init system to reboot or power off."""
     try:
         done = subprocess.run(["systemctl", verb], capture_output=True, timeout=10, check=False)
     except (OSError, subprocess.SubprocessError) as error:

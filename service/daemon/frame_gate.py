@@ -76,7 +76,6 @@ class FrameGate(Relayed):
 
     @property
     def busy_s(self) -> float:
-        """Seconds spent on the current frame; 0 while waiting for the camera."""
         taken_s = self._taken_s
         return 0.0 if taken_s is None else time.monotonic() - taken_s
 

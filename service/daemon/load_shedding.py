@@ -86,8 +86,6 @@ class Move:
 
 
 class Ladder:
-    """The current load level and its transitions."""
-
     def __init__(self, config: ComputeConfig) -> None:
         self.config = config
         self.level = Level.FULL

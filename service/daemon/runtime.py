@@ -189,7 +189,6 @@ class Daemon:
             return None
 
     def snapshot(self) -> dict[str, Any]:
-        """The service's state, for /status and /metrics."""
         health, status = self._health(), self.actions.status()
         figures = {"speed_m_s": status.speed_m_s, "distance_m": status.distance_m}
         run, scan, backend = self.scanning.run, self.scanning.scan, self.scanning.backend
@@ -222,7 +221,6 @@ class Daemon:
         } | {key: value for key, value in figures.items() if math.isfinite(value)}
 
     def _mavlink(self) -> dict[str, Any]:
-        """State of the links to the vehicle, as far as known."""
         report = self.vehicle.report()
         figures = {
             "links_up": sum(link.is_up for link in report.links),
@@ -301,7 +299,6 @@ class Daemon:
         return getattr(self.scanning.backend, "failure", None) or ""
 
     def _report_device(self) -> None:
-        """Report once that the device has failed and the CPU has replaced it."""
         failure = self._backend_failure()
         if failure and failure != self._reported_failure:
             self.vehicle.statustext(f"Compute device failed: {failure}", CRITICAL)

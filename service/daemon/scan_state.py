@@ -16,8 +16,6 @@ FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
 
 
 class State(Enum):
-    """What runs, and what is wanted."""
-
     IDLE = "idle", Phase.IDLE
     WAITING = "waiting", Phase.WAITING  # for the next attempt at the wanted scan
     WAITING_PAUSED = "waiting paused", Phase.WAITING
@@ -43,7 +41,6 @@ class State(Enum):
 
     @property
     def is_wanted(self) -> bool:
-        """From start to stop, pauses and retries included."""
         return Event.STOP in TRANSITIONS[self]
 
     @property
@@ -52,8 +49,6 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What happens to a scan."""
-
     START = "start"  # a scan is wanted now; ends a pause
     STOP = "stop"
     PAUSE = "pause"

@@ -95,7 +95,6 @@ class ScanRun:
         self.progress_s = self.clock_s()
 
     def new_camera_warnings(self) -> list[str]:
-        """Camera warnings since the last call."""
         gate = self.gate
         fresh = [] if gate is None else gate.warnings[self.warnings_reported :]
         self.warnings_reported += len(fresh)
@@ -113,12 +112,10 @@ class ScanRun:
         )
 
     def finish(self, fault: str) -> None:
-        """Answer a command that waits for the end."""
         if self.work is not None:
             self.work.finish(Answer(Result.FAILED, fault) if fault else ACCEPTED)
 
     def configure(self, config: Config, level: Level) -> None:
-        """Use the live keys of ``config``, reduced to a load level."""
         scan, gate = self.scan, self.gate
         if scan is not None and gate is not None:
             scan.configure(config, lowered(config.compute, level))
@@ -382,7 +379,6 @@ class Scanning:
             self._apply()
 
     def set_level(self, level: Level) -> None:
-        """Change the load level, in this scan and in the next."""
         with self._lock:
             self.level = level
             self._apply()
@@ -400,7 +396,6 @@ class Scanning:
     # ---- the scan's thread ------------------------------------------------------------------
 
     def _open(self) -> None:
-        """Start an attempt at the wanted scan."""
         self.fault = ""
         run = self.run = ScanRun(self.life.failures == 0, self._clock_s)
         self._runs = [*self._live(), run]

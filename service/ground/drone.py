@@ -41,15 +41,11 @@ UNREADABLE_REST_S, MAX_UNREADABLE = 60.0, 64
 
 
 class Item(NamedTuple):
-    """A message of parts of a scan's records."""
-
     scan: str
     data: bytes
 
 
 class Radio(NamedTuple):
-    """A message of the narrow radio."""
-
     header: ScanHeader
     kind: str
     number: int
@@ -130,7 +126,6 @@ class DroneReceiver:
         return list(self._scans.values())
 
     def is_idle(self, now: float) -> bool:
-        """Whether it is silent and has nothing open."""
         return not self._scans and now - self.heard_at > self._limits.silent_s
 
     def handle(self, heads: dict[str, bytes], events: list[Event], now: float) -> list[Effect]:

@@ -69,7 +69,6 @@ class Front:
             return BoundedListener(self._host, self._port, fitting(LIMITS, 8))
 
     def close(self) -> None:
-        """Release the address where :meth:`run` was not called."""
         self._listener.close()
 
     def run(self, worker: Worker) -> None:

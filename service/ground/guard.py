@@ -60,7 +60,6 @@ class Tokens:
         self._ended: dict[str, float] = {}  # holders that logged out; until no cookie is valid
 
     def name_of(self, token: str) -> str | None:
-        """Name of the holder of ``token``; None for a wrong one."""
         given = token.encode(errors="replace")
         found = [n for n, known in self._by_name.items() if hmac.compare_digest(given, known)]
         return found[0] if found else None
@@ -191,7 +190,6 @@ class Pace:
         self._left, self._at = float(burst), clock()
 
     def take(self) -> bool:
-        """Whether one more is allowed now."""
         now = self._clock()
         self._left = min(self._burst, self._left + (now - self._at) * self._rate_hz)
         self._at = now
@@ -228,7 +226,7 @@ CLOSE = {"connection": "close"}
 
 
 class _StalledError(Exception):
-    """The other end has stopped reading."""
+    pass
 
 
 class RequestLimits:
@@ -305,7 +303,6 @@ def _most(scope: Scope) -> int:
 
 
 def is_length(text: str) -> bool:
-    """Whether it is a number of bytes, written in few digits."""
     return text.isascii() and text.isdigit() and len(text) < 12
 
 

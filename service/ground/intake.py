@@ -42,7 +42,6 @@ class Introduction:
         self.head, self.seen_at = head, now
 
     def next_ask(self, now: float) -> RangeSet | None:
-        """The number of the header to ask for now, if any."""
         wanted = None if self.head is None else self.head.numbers.get("header")
         if not wanted or now < self._ask_at:
             return None
@@ -203,7 +202,6 @@ class ScanIntake:
 
     @property
     def held_bytes(self) -> int:
-        """Memory that unfinished records take."""
         return self._assembler.held_bytes
 
     def forget_unfinished(self) -> None:

@@ -90,7 +90,7 @@ FILES: dict[str, str] = {
 
 
 class ConflictError(InputError):
-    """Somebody else was faster, or is at it."""
+    pass
 
 
 class Library:
@@ -185,7 +185,6 @@ class Library:
             yield folder
 
     def delete(self, drone: str, scan: str) -> str:
-        """Move a scan to the bin; the name it has there."""
         with self.changing(drone, scan) as folder:
             name = f"{drone}~{scan}~{time.time_ns()}"
             _move(folder, self.store / BIN / name)
@@ -324,7 +323,6 @@ def _tags(tags: Any) -> tuple[str, ...]:
 
 
 def _safe(name: str, what: str) -> str:
-    """A folder name made of ``name``."""
     out = re.sub(r"[^A-Za-z0-9._-]+", "-", name).lstrip(".-")[:100]
     return out or what
 

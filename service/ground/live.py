@@ -90,7 +90,6 @@ def chunk_message(store: ScanStore, seq: int, layer: int) -> bytes | None:
 
 
 def emptied(message: bytes) -> bytes:
-    """A chunk's message without any of its pixels."""
     (size,) = struct.unpack_from("<I", message)
     head = json.loads(message[4 : 4 + size]) | {"box": [0] * 4, "bytes": [0] * 6}
     text = json.dumps(head).encode()
@@ -221,7 +220,6 @@ class LiveFeed:
 
 
 def track_message(track: FlightPath) -> str:
-    """The flight path, thinned, and the state of the last pose."""
     message: dict[str, Any] = {"type": "track", "track": track.places()}
     last = track.last
     if last is not None:

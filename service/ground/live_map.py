@@ -58,7 +58,6 @@ def mercator(lat_deg: F64, lon_deg: F64) -> F64:
 
 
 def degrees(x: float, y: float) -> tuple[float, float]:
-    """(latitude, longitude) of a place in that square."""
     return math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * y)))), 360.0 * (x - 0.5)
 
 
@@ -69,8 +68,6 @@ def pixel_m(zoom: int, lat_deg: float) -> float:
 
 @dataclass(slots=True, eq=False)
 class _Drawn:
-    """One tile, and the state of each keyframe that is in it."""
-
     states: dict[int, State] = field(default_factory=dict)
     sigma: F32 = field(default_factory=lambda: np.full(WIDE * WIDE, np.inf, np.float32))
     height: F32 = field(default_factory=lambda: np.full(WIDE * WIDE, np.nan, np.float32))
@@ -79,8 +76,6 @@ class _Drawn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Points:
-    """A keyframe's points, the surest last."""
-
     place: F64  # (N, 2) in the square of Web Mercator
     height_m: F32  # NaN where it is not measured
     sigma_m: F32
@@ -233,7 +228,6 @@ def unmeasured(keyframe: Keyframe, image: bytes) -> PointCloud:
 
 
 def _corner(tile: Tile) -> F64:
-    """(2,) the north-west corner of a tile's margin."""
     zoom, x, y = tile
     return (np.array([x, y]) - MARGIN / SIDE) / (1 << zoom)
 

@@ -104,7 +104,6 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
 def _by_time(
     found: Iterator[tuple[str, int, Any]],
 ) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The messages of each time, by topic, in the order of their first."""
     waiting: dict[int, dict[str, Any]] = {}
     for topic, time_ns, message in found:
         waiting.setdefault(time_ns, {})[topic] = message
@@ -302,7 +301,6 @@ _BROKEN = (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, 
 
 
 def _records(path: Path) -> Iterator[Any]:
-    """The records of the file and of its chunks, in order."""
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
@@ -320,7 +318,6 @@ def _records(path: Path) -> Iterator[Any]:
 
 
 def _in_chunk(chunk: Any) -> Iterator[Any]:
-    """The records in a chunk, one at a time."""
     from mcap.data_stream import ReadDataStream
     from mcap.opcode import Opcode
     from mcap.records import Channel, Message, Schema

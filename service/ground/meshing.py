@@ -59,7 +59,6 @@ def queue_meshes(jobs: Jobs, store: Path, may_begin: Callable[[], bool]) -> None
 
 
 def drop(folder: Path) -> None:
-    """The mesh of a scan is not due any more."""
     MESH.begin(folder)
     MESH.end(folder)
 

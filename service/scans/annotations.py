@@ -45,8 +45,6 @@ class LineString(msgspec.Struct, forbid_unknown_fields=True, tag_field="type", t
 
 
 class About(msgspec.Struct, forbid_unknown_fields=True):
-    """The text of a place, who wrote it and when."""
-
     text: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_TEXT)]
     by: Annotated[str, msgspec.Meta(max_length=100)]
     made_unix_s: Annotated[float, msgspec.Meta(ge=-1e11, le=1e11)]

@@ -241,7 +241,6 @@ def round_length(most: float) -> float:
 
 
 def _draw_scale_bar(panel: U8, metres_per_px: float) -> None:
-    """A bar of round length, about a fifth of the panel wide."""
     length_m = round_length(panel.shape[1] * metres_per_px / 5.0)
     length_px = round(length_m / metres_per_px)
     grown = _growth(panel)
@@ -262,7 +261,6 @@ def _draw_north(panel: U8) -> None:
 
 
 def _draw_height_legend(panel: U8, ends_m: Sequence[float]) -> None:
-    """The colour scale with its two heights."""
     low, high = ends_m
     grown = _growth(panel)
     edge, wide, words = (round(v * grown) for v in (12, 10, 28))
@@ -339,7 +337,6 @@ class Panel:
 
 
 def debug_path(folder: Path, seq: int) -> Path:
-    """Path of the stages of keyframe ``seq`` when ``scan.keep_debug`` is on."""
     return folder / "debug" / f"keyframe_{seq:06d}.npz"
 
 

@@ -173,7 +173,6 @@ def strip_edges(extents: Iterable[Extent], max_points: int) -> list[float]:
 
 
 def _inside(extents: Iterable[Extent], low_m: float, high_m: float) -> list[Extent]:
-    """Those that reach into a strip."""
     margin = 1.0  # edges are moved by up to a voxel
     return [e for e in extents if e.box[2] >= low_m - margin and e.box[0] <= high_m + margin]
 

@@ -59,7 +59,6 @@ def _stretches(rows: object) -> list[Stretch]:
 
 
 def is_apart(seq: int, apart: Iterable[Stretch]) -> bool:
-    """True for a keyframe within one of the stretches."""
     return any(first <= seq <= last for first, last in apart)
 
 
@@ -79,7 +78,6 @@ def main_seqs(store: Keyframes) -> list[int]:
 
 
 def main_keyframes(store: Keyframes) -> Iterator[Keyframe]:
-    """The main piece's keyframes in order of their number."""
     for seq in main_seqs(store):
         found = store.keyframe(seq)
         if found is not None:

@@ -288,7 +288,6 @@ def _above_ground(poses: Sequence[PoseRecord], raster: Raster | None) -> Sequenc
 
 
 def _pixel_m(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> float | None:
-    """Median ground sample straight below the camera."""
     camera = _lens(summary)
     heights = [p.agl_m for p in poses if p.agl_m is not None]
     return float(np.median(heights)) / camera[0][0, 0] if camera and heights else None

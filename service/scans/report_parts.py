@@ -11,7 +11,6 @@ from recon.types import U8
 
 
 def area(value_m2: float) -> str:
-    """Such as ``10,546 m²``."""
     return f"{value_m2:,.0f} m²"
 
 
@@ -23,7 +22,6 @@ def length(value_m: float) -> str:
 
 
 def within(sigma_m: float) -> str:
-    """Such as ``± 3.2 cm``."""
     return f"± {length(sigma_m)}"
 
 

@@ -62,7 +62,6 @@ def close_open_scans(
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk of a folder."""
     return shutil.disk_usage(folder).free
 
 

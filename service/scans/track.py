@@ -88,7 +88,6 @@ def tum_lines(poses: Sequence[PoseRecord]) -> str:
 
 
 def seconds_text(time_unix_ns: int) -> str:
-    """Seconds with nine decimals, exactly."""
     return f"{time_unix_ns // 10**9}.{time_unix_ns % 10**9:09d}"
 
 

@@ -43,7 +43,6 @@ def sync(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes | str) -> None:
-    """Write a file of bytes or UTF-8 by :func:`writing`."""
     with writing(path) as part:
         part.write_bytes(data.encode() if isinstance(data, str) else data)
 
@@ -125,7 +124,6 @@ def _remove_abandoned(path: Path) -> None:
 
 
 def _remove(part: Path) -> None:
-    """Remove a file, or a folder with all it holds, if it is there."""
     if part.is_dir() and not part.is_symlink():
         shutil.rmtree(part)
     else:

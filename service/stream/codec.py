@@ -66,12 +66,10 @@ class LayerHead:
 
     @property
     def grid_px(self) -> tuple[int, int]:
-        """(w, h) of this layer's grid."""
         return -(-self.full_px[0] // self.factor), -(-self.full_px[1] // self.factor)
 
     @property
     def grid_K(self) -> F64:
-        """(3, 3) intrinsics of this layer's grid."""
         return scaled_K(self.K, 1.0 / self.factor, 1.0 / self.factor)
 
 

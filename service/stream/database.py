@@ -252,7 +252,6 @@ class Database:
             return self._connection.total_changes - before
 
     def get(self, key: str) -> str | None:
-        """A text of the meta table."""
         row = self.one("SELECT value FROM meta WHERE key = ?", (key,))
         return None if row is None else str(row[0])
 

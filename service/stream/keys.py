@@ -40,7 +40,6 @@ class Fleet:
 
     @property
     def everybody(self) -> list[tuple[str, str]]:
-        """Role and name of each member."""
         return [(role, name) for role, names in self.members.items() for name in names]
 
     def with_members(self, role: str, names: Sequence[str]) -> Fleet:

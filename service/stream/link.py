@@ -73,8 +73,6 @@ class LinkProgress:
 
 @dataclass(slots=True, eq=False)
 class _LinkSession:
-    """A session with one ground station or router, or with those that call us."""
-
     config: SessionConfig
     session: zenoh.Session | None = None  # while it is open
     heard_at: float | None = None  # on this session; monotonic s
@@ -155,7 +153,6 @@ class DatalinkSender:
         self._wake.set()
 
     def set_budget(self, budget_kbit_s: float, share: float) -> None:
-        """Change the link's rate, in flight."""
         rate = _rate(budget_kbit_s, share)
         self._post(lambda now: self._outbox.set_rate(rate, now))
 

@@ -93,7 +93,6 @@ class LiveLane:
         return out
 
     def peek(self, part_bytes: int) -> Outgoing | None:
-        """The next message, or None."""
         while not self._messages:
             self._current = None
             if not self._queue:
@@ -105,7 +104,6 @@ class LiveLane:
         return self._messages[0]
 
     def pop(self) -> None:
-        """Remove the message that :meth:`peek` returned."""
         self._messages.popleft()
         if not self._messages:
             self._current = None
@@ -216,8 +214,6 @@ POSE_ROOM, COARSE_ROOM, FINE_ROOM = 64, 32, 4
 
 @dataclass(slots=True, eq=False)
 class _Feed:
-    """One offered scan."""
-
     store: ScanStore
     head_due: float
     head_sent: float = -1e9

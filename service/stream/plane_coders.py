@@ -276,7 +276,6 @@ def _restore(residuals: U16, c: I64, k: I64, size: tuple[int, int], weights: I64
 
 
 def _padded(plane: npt.NDArray[np.generic]) -> I64:
-    """The plane in a margin of zeros, flat."""
     return np.pad(plane.astype(np.int64), MARGIN).reshape(-1)
 
 

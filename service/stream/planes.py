@@ -44,7 +44,6 @@ class Planes:
     known: Bool  # (h, w)
 
     def crop(self, box: tuple[int, int, int, int]) -> Planes:
-        """The part inside ``box`` (x, y, w, h)."""
         x, y, w, h = box
         cut = np.s_[y : y + h, x : x + w]
         return Planes(

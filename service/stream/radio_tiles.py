@@ -133,7 +133,6 @@ class RadioStore:
         return decoded if decoded is not None and decoded.seq == seq else None
 
     def seqs(self) -> set[int]:
-        """Numbers of the keyframes that have tiles."""
         sql = f"SELECT DISTINCT number FROM radio WHERE kind = 'tile' AND {is_number('number')}"
         return {row[0] for row in self._db.all(sql)}
 

@@ -22,7 +22,6 @@ Pairs = list[tuple[int, int]]
 
 
 def is_number(column: str) -> str:
-    """The SQL condition that a column holds a number of an item."""
     return f"typeof({column}) = 'integer' AND {column} BETWEEN 0 AND {MAX_NUMBER}"
 
 
@@ -89,12 +88,10 @@ class RangeSet:
             yield from range(first, last + 1)
 
     def newest_first(self) -> Iterator[int]:
-        """The numbers, largest first."""
         for at in range(len(self._edges) - 1, 0, -2):  # of many ranges often only the last counts
             yield from range(self._edges[at] - 1, self._edges[at - 1] - 1, -1)
 
     def __sub__(self, other: RangeSet) -> RangeSet:
-        """The numbers that are not in ``other``."""
         if not self or self == other:  # most often
             return RangeSet()
         edges = np.union1d(self._edges, other._edges)

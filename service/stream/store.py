@@ -171,7 +171,6 @@ class ScanStore:
 
     @property
     def refinement(self) -> dict[str, Any] | None:
-        """The figures of the refinement in force, or None."""
         note = json_object(self.database.get("refinement"))
         figures = note.get("figures")
         return figures if isinstance(figures, dict) and not figures.get("undone") else None
@@ -298,7 +297,6 @@ class ScanStore:
         self._only = frozenset(seqs)
 
     def seqs(self) -> list[int]:
-        """Numbers of the keyframes with any stored layer."""
         if self._only is not None:
             return sorted(self._only)
         sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')} AND {_IS_LAYER}"
@@ -320,7 +318,6 @@ class ScanStore:
     # Poses and re-poses
 
     def add_pose(self, pose: PoseRecord) -> int:
-        """Store a pose under the next number; returns it."""
         return self.add_poses([pose])
 
     def add_poses(self, poses: Sequence[PoseRecord]) -> int:
@@ -501,7 +498,6 @@ class ScanStore:
             return read_header(text.encode())
 
     def next_id(self, table: str) -> int:
-        """The number of the next row of a table."""
         row = self.database.one(f"SELECT MAX(id) FROM {table} WHERE {is_number('id')}")
         return 1 if row is None or row[0] is None else int(row[0]) + 1
 
