@@ -91,23 +91,15 @@ def icosphere(subdivisions: int) -> tuple[F64, I32]:
         [11, 10, 2], [10, 7, 6], [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8],
         [3, 8, 9], [4, 9, 5], [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1],
     ]  # fmt: skip
-    points = [np.array(p) / np.linalg.norm(p) for p in v]
+    corners = np.array([v[k] for triangle in f for k in triangle], float).reshape(-1, 3, 3)
+    corners /= np.linalg.norm(corners, axis=2, keepdims=True)
     for _ in range(subdivisions):
-        middle: dict[tuple[int, int], int] = {}
-        finer = []
-        for a, b, c in f:
-            ids = []
-            for i, j in ((a, b), (b, c), (c, a)):
-                key = (min(i, j), max(i, j))
-                if key not in middle:
-                    p = points[i] + points[j]
-                    middle[key] = len(points)
-                    points.append(p / np.linalg.norm(p))
-                ids.append(middle[key])
-            ab, bc, ca = ids
-            finer += [[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]
-        f = finer
-    return np.array(points), np.array(f, np.int32)
+        a, b, c = corners.transpose(1, 0, 2)
+        ab, bc, ca = (m / np.linalg.norm(m, axis=1, keepdims=True) for m in (a + b, b + c, c + a))
+        finer = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+        corners = np.concatenate([np.stack(triangle, axis=1) for triangle in finer])
+    points, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return points, index.reshape(-1, 3).astype(np.int32)
 
 
 SPHERE = icosphere(2)
