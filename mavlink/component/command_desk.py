@@ -161,7 +161,7 @@ class CommandDesk:
             limit_ns, report_ns = now_ns + WORK_LIMIT_NS, now_ns + PROGRESS_EVERY_NS
             self._last = None
             self._running[slot] = _Running(call, key, window_ns, handled, limit_ns, report_ns)
-            if handled.answer is None:
+            if handled.answer is None and not handled.is_brief:
                 self._progress(component, call, handled)
             self.tick(now_ns)
         else:

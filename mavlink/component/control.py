@@ -39,8 +39,9 @@ class Work:
     result, and finishes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, is_brief: bool = False) -> None:
         self._lock = threading.Lock()
+        self.is_brief = is_brief  # usually done within half a second: no progress until then
         self.fraction = 0.0  # progress, 0 to 1
         self.answer: Handled | None = None  # the result, or the work that follows; None: it runs
         self.cancelled = False

@@ -302,7 +302,7 @@ class Scanning:
     def stop(self) -> Work:
         """Drop the wanted scan; the work ends once no power cut can bring it back."""
         self.handle(Event.STOP)
-        work = Work()
+        work = Work(is_brief=True)
 
         def settle(_: Worker) -> None:
             self.resumption.settle()

@@ -659,6 +659,14 @@ def test_work_that_is_done_at_once_needs_no_progress(ends: Ends) -> None:
     assert "Self-test: no camera" in ends.texts()
 
 
+def test_brief_work_reports_progress_only_if_it_is_slow(ends: Ends) -> None:
+    work = ends.control.works["stop_scan"] = Work(is_brief=True)
+    assert ends.command(2501, 100) == []
+    assert results(ends.pass_time(0.6), 2501) == [RUNNING]
+    work.finish()
+    assert results(ends.pass_time(0.1), 2501) == [ACCEPTED]
+
+
 def cancel_message(number: int, source: tuple[int, int] = STATION) -> bytes:
     payload = struct.pack("<HBB", number, 1, 191)
     head = bytes((0xFD, len(payload), 0, 0, 0, *source, COMMAND_CANCEL, 0, 0))
