@@ -158,6 +158,7 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
         daemon.quit()
         service.join(timeout=240)
     acks = {(a.command, a.result) for a in autopilot.of("COMMAND_ACK")}
+    acks.discard((2501, 5))  # in progress, until the disk has it
     assert acks == {(2500, 0), (2000, 0), (2501, 0)}
     (folder,) = (path.parent for path in (tmp_path / "scans").glob("*/" + SUMMARY))
     _check_odometry(autopilot.of("ODOMETRY"))
