@@ -51,8 +51,6 @@ log = logging.getLogger(__name__)
 
 V4L2_OPTIONS = ("video_size", "framerate", "input_format")
 
-OPEN_S = 10.0
-
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
 """The last one: open the stream at once, without waiting some twenty images for its rate."""
 
@@ -77,6 +75,7 @@ The images of that time are kept: the next one to start from is seconds away."""
 class LiveConfig:
     """When a live camera counts as lost, and how it is reopened."""
 
+    open_s: float = 10.0  # no stream for this long: it cannot be opened
     stall_s: float = 3.0  # no image for this long: reopen
     frozen_s: float = 8.0  # the same image for this long: reopen
     changed_s: float = 1.0  # images of another shape for this long: no fault of the stream
@@ -84,6 +83,9 @@ class LiveConfig:
     longest_changed_s: float = 16.0  # or at most so long: a stream that flips is not many scans
     first_retry_s: float = 0.25
     longest_retry_s: float = 5.0
+
+
+DEFAULT = LiveConfig()
 
 
 class StampFilter:
@@ -129,7 +131,7 @@ class LiveSource(CameraSource):
         self,
         open_container: Callable[[float], av.container.InputContainer],
         description: str,
-        config: LiveConfig | None = None,
+        config: LiveConfig = DEFAULT,
         listens: bool = False,
     ) -> None:
         """Open the stream by ``open_container(stall_s)`` and decode its first image.
@@ -138,7 +140,7 @@ class LiveSource(CameraSource):
         where it ``listens``; the constructor does not retry.
         """
         super().__init__(description)
-        self.config = config or LiveConfig()
+        self.config = config
         self.losses = 0
         self.misfits = 0  # images of another aspect ratio, dropped
         self.epoch_unix_ns = time.time_ns()
@@ -152,7 +154,9 @@ class LiveSource(CameraSource):
         self._images = self._connect()
         first = next(self._images, None)
         if first is None and listens and self._is_silent:
-            raise NoSenderError(f"{description}: waits for a sender; none came in {OPEN_S:g} s")
+            raise NoSenderError(
+                f"{description}: waits for a sender; none came in {self.config.open_s:g} s"
+            )
         if first is None:
             why = f" ({self.warnings[-1]})" if self.warnings else ""
             raise OutsideError(
@@ -239,7 +243,7 @@ class LiveSource(CameraSource):
             container = self._open_container(self.config.stall_s)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             self._is_silent = isinstance(error, (av.error.ExitError, TimeoutError))
-            silent = f"no stream for {OPEN_S:g} s"
+            silent = f"no stream for {self.config.open_s:g} s"
             self._warn(silent if self._is_silent else f"cannot be opened: {error}")
             return
         try:
@@ -326,18 +330,21 @@ def open_stream(rest: str, options: Mapping[str, str]) -> CameraSource:
     return _live(rest, TS_OPTIONS if rest.startswith("udp:") else LIVE_OPTIONS)
 
 
-def open_rtmp_listen(rest: str, options: Mapping[str, str]) -> CameraSource:
+def open_rtmp_listen(
+    rest: str, options: Mapping[str, str], config: LiveConfig = DEFAULT
+) -> CameraSource:
     """What is sent to this machine by RTMP, to ``rest``: ``[HOST:]PORT[/NAME]``."""
     reject_options("rtmp-listen", options)
     place = re.fullmatch(r"(?:([^/\s:]+):)?(\d{1,5})(?:/(\S*))?", rest)
     if place is None or not 0 < int(place[2]) < 65536:
         raise InputError(f"rtmp-listen:{rest} is not like rtmp-listen:1935/live")
     # The wait for a sender has a limit of its own: a sender that comes late in it is heard out.
-    waits = LISTEN_OPTIONS | {"timeout": f"{OPEN_S:.0f}"}
-    return _live(f"rtmp://{place[1] or '0.0.0.0'}:{place[2]}/{place[3] or ''}", waits, listens=True)
+    waits = LISTEN_OPTIONS | {"timeout": f"{config.open_s:.0f}"}
+    url = f"rtmp://{place[1] or '0.0.0.0'}:{place[2]}/{place[3] or ''}"
+    return _live(url, waits, listens=True, config=config)
 
 
-def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
+def open_srt(rest: str, options: Mapping[str, str], config: LiveConfig = DEFAULT) -> CameraSource:
     """MPEG-TS by SRT: without a host it is waited for, ``srt://:9000``, else fetched. GStreamer
     receives it: PyAV from PyPI comes without SRT."""
     reject_options("srt", options)
@@ -350,7 +357,8 @@ def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
     source = ["srtsrc", f"uri=srt:{rest}", limit, *([] if place[1] else ["mode=listener"])]
     description = without_credentials(f"srt:{rest}")
     pipeline = [*source, "!", "fdsink", "fd=1"]
-    return _launched(pipeline, description, LISTEN_OPTIONS | UNPARSED, listens=not place[1])
+    demuxer, listens = LISTEN_OPTIONS | UNPARSED, not place[1]
+    return _launched(pipeline, description, demuxer, listens, config)
 
 
 def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
@@ -363,16 +371,20 @@ def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
 
 
 def _live(
-    url: str, demuxer: dict[str, str], format_: str | None = None, listens: bool = False
+    url: str,
+    demuxer: dict[str, str],
+    format_: str | None = None,
+    listens: bool = False,
+    config: LiveConfig = DEFAULT,
 ) -> CameraSource:
     def opened(stall_s: float) -> av.container.InputContainer:
-        timeout = (2.0 * OPEN_S if listens else OPEN_S, stall_s)
+        timeout = (2.0 * config.open_s if listens else config.open_s, stall_s)
         made: av.container.InputContainer = open_container(
             url, format=format_, options=demuxer, timeout=timeout
         )
         return made
 
-    return Paced(LiveSource(opened, without_credentials(url), listens=listens))
+    return Paced(LiveSource(opened, without_credentials(url), config, listens))
 
 
 TAIL = (
@@ -395,7 +407,11 @@ def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
 
 
 def _launched(
-    elements: list[str], description: str, demuxer: dict[str, str], listens: bool = False
+    elements: list[str],
+    description: str,
+    demuxer: dict[str, str],
+    listens: bool = False,
+    config: LiveConfig = DEFAULT,
 ) -> CameraSource:
     """Output of a GStreamer pipeline that writes a container to its standard output."""
     launcher = shutil.which("gst-launch-1.0")
@@ -407,9 +423,9 @@ def _launched(
     command = [launcher, "-q", *elements]
 
     def opened(stall_s: float) -> Any:
-        return open_command(command, stall_s, demuxer)
+        return open_command(command, stall_s, demuxer, config.open_s)
 
-    return Paced(LiveSource(opened, description, listens=listens))
+    return Paced(LiveSource(opened, description, config, listens))
 
 
 OUTPUT_BYTES = 1 << 18
@@ -420,12 +436,12 @@ class _Command:
     """A command: its output as a file, its standard error in the log. FFmpeg's own pipe waits for a
     silent command for ever."""
 
-    def __init__(self, command: list[str]) -> None:
+    def __init__(self, command: list[str], wait_s: float) -> None:
         pipe = subprocess.PIPE
         process = open_process("gst", command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe)
         assert process.stdout is not None
         assert process.stderr is not None
-        self.wait_s = OPEN_S
+        self.wait_s = wait_s
         self.complaint = ""  # the first one
         self._process, self._output, self._errors = process, process.stdout, process.stderr
         self._poll = select.poll()
@@ -453,12 +469,14 @@ class _Command:
         self._reader.join(1.0)
 
 
-def open_command(command: list[str], stall_s: float, demuxer: dict[str, str]) -> Any:
+def open_command(
+    command: list[str], stall_s: float, demuxer: dict[str, str], open_s: float = DEFAULT.open_s
+) -> Any:
     """A container with the output of ``command``; closing it ends the command. Raises OSError with
     the command's own complaint when it writes no video."""
     import av
 
-    running = _Command(command)
+    running = _Command(command, open_s)
     try:
         container = av.open(running, options=demuxer, buffer_size=OUTPUT_BYTES)
     except BaseException as error:

@@ -11,19 +11,23 @@ from typing import Any
 import av
 import numpy as np
 
+STEP_S = Fraction(1, 50)
 
-def clip(n: int, size_px: tuple[int, int] = (64, 48), moving: bool = True) -> bytes:
-    """``n`` Matroska images of noise, 20 ms apart; all the same unless ``moving``."""
+
+def clip(
+    n: int, size_px: tuple[int, int] = (64, 48), moving: bool = True, step_s: Fraction = STEP_S
+) -> bytes:
+    """``n`` Matroska images of noise; all the same unless ``moving``."""
     data = io.BytesIO()
     with av.open(data, "w", format="matroska") as out:
-        stream: Any = out.add_stream("ffv1", rate=50)
+        stream: Any = out.add_stream("ffv1", rate=1 / step_s)
         stream.width, stream.height = size_px
         stream.pix_fmt = "yuv420p"
         for i in range(n):
             noise = np.random.default_rng(i if moving else 0)
             image = noise.integers(0, 256, (size_px[1], size_px[0], 3), np.uint8)
             frame = av.VideoFrame.from_ndarray(image, format="bgr24")
-            frame.pts, frame.time_base = i, Fraction(1, 50)
+            frame.pts, frame.time_base = i, step_s
             out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
     return data.getvalue()

@@ -485,14 +485,11 @@ def no_collector() -> Iterator[None]:
 
 def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:
     """Its images are hours apart; closing does not wait for the next one."""
-    data = clip(3)
     path = tmp_path / "v.mkv"
-    path.write_bytes(data)
-    recording = open_camera(str(path))
-    recording._start_s = -3600  # type: ignore[attr-defined]
-    paces = Paced(recording)
+    path.write_bytes(clip(3, step_s=Fraction(3600)))
+    paces = Paced(open_camera(str(path)))
     threading.Timer(0.3, paces.close).start()
-    assert list(paces) == []
+    assert [frame.time_ns for frame in paces] == [0]
 
 
 def test_a_recording_is_not_closed_while_an_image_is_decoded(
@@ -680,16 +677,16 @@ LISTENING = {
 @needs_ffmpeg
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", LISTENING)
-def test_who_sends_is_waited_for_again(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_sends_is_waited_for_again(kind: str) -> None:
     """The sender comes late, ends, and comes again: one time axis, and no long pause."""
     if kind == "srt" and not has_gstreamer("srtsrc"):
         pytest.skip("needs GStreamer's srtsrc")
-    monkeypatch.setattr(live, "OPEN_S", 1.0)  # the first attempts end before anyone sends
     port = free_port()
     source, url, container = (text.format(port=port) for text in LISTENING[kind])
+    word, _, rest = source.partition(":")
+    opened = {"rtmp-listen": live.open_rtmp_listen, "srt": live.open_srt}[word]
     with pytest.raises(NoSenderError, match="waits for a sender; none came in 1 s"):
-        open_camera(source)
-    monkeypatch.undo()
+        opened(rest, {}, LiveConfig(open_s=1.0))  # ends before anyone sends
     sender = Sender(url, container)
     frames = []
     try:
@@ -734,18 +731,15 @@ def test_an_attempt_that_waited_for_a_sender_is_followed_by_the_next_at_once() -
     assert waits[1:3] == [0.0, 0.0]
 
 
-def test_a_sender_that_comes_late_while_it_is_waited_for_is_heard_out(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_sender_that_comes_late_while_it_is_waited_for_is_heard_out() -> None:
     """The wait ended in the midst of its handshake, and the sender was cut off."""
-    monkeypatch.setattr(live, "OPEN_S", 2.0)
-    port = free_port()
+    port, soon = free_port(), LiveConfig(open_s=2.0)
     with pytest.raises(NoSenderError):
-        open_camera(f"rtmp-listen:127.0.0.1:{port}/live")
+        live.open_rtmp_listen(f"127.0.0.1:{port}/live", {}, soon)
 
     def wait() -> None:
         with pytest.raises(OutsideError):
-            open_camera(f"rtmp-listen:127.0.0.1:{port}/live")
+            live.open_rtmp_listen(f"127.0.0.1:{port}/live", {}, soon)
 
     waiting = threading.Thread(target=wait)
     waiting.start()
