@@ -417,8 +417,8 @@ def _by_listening(config: Config, listen_s: float) -> Iterator[Finding]:
     except InputError as error:
         yield Finding("mavlink", BAD, str(error))
         return
-    vehicle.start()
     try:
+        vehicle.start()
         end_s = time.monotonic() + listen_s
         while time.monotonic() < end_s:
             vehicle.set_health(Health.STANDBY)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 from autopilot import beat, packed
+from file_modes import bound_by_modes
 from loopback import until
 from rehearsal import RehearsalControl
 
@@ -122,15 +122,11 @@ def test_times_are_saved_within_a_second_of_a_crash(tmp_path: Path) -> None:
     link.stop()
 
 
-def test_a_key_of_another_user_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Path) -> bytes:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
+def test_a_key_of_another_user_is_named(tmp_path: Path) -> None:
     path = tmp_path / "key"
-    path.touch(0o600)
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    path.touch(0)
     with pytest.raises(ValueError, match=r"key: the signing key cannot be read.*chown"):
-        read_key(path)
+        bound_by_modes(lambda: read_key(path))
 
 
 def test_keys_must_be_private_and_whole(tmp_path: Path) -> None:

@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import _thread
 import json
 import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-from loopback import free_port
+from file_modes import bound_by_modes
+from loopback import free_port, until
 from paths import DEMO
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
-from service.commands import diagnosis
-from service.commands.diagnosis import BAD, GOOD, NOTE, examine, examine_compute, examine_software
+from service.cameras import CAMERAS, CameraSource
+from service.cameras.live import LiveConfig, open_rtmp_listen
+from service.commands.diagnosis import (
+    BAD,
+    GOOD,
+    NOTE,
+    Grade,
+    examine,
+    examine_compute,
+    examine_software,
+)
 from service.config import load_config
+from service.daemon.warm_up import MARKER
+from service.version import software
 
 
 def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str]]:
@@ -27,14 +41,18 @@ def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str
     return {f.what: (f.verdict, f.text) for f in found}
 
 
-def test_links_are_closed_where_it_is_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(_: object) -> None:
-        raise KeyboardInterrupt
+def test_links_are_closed_where_it_is_interrupted() -> None:
+    def threads() -> list[str]:
+        return [t.name for t in threading.enumerate() if t.name.startswith("mavlink")]
 
-    monkeypatch.setattr("mavlink.component.vehicle.VehicleLink.report", interrupted)
+    def interrupt() -> None:
+        assert until(lambda: any(name.endswith("read") for name in threads()), 60.0)
+        _thread.interrupt_main()
+
+    threading.Thread(target=interrupt, daemon=True).start()
     with pytest.raises(KeyboardInterrupt):
-        findings(f"mavlink.links=udpin:127.0.0.1:{free_port()}")
-    assert not [t.name for t in threading.enumerate() if t.name.startswith("mavlink")]
+        findings(f"mavlink.links=udpin:127.0.0.1:{free_port()}", listen_s=60.0)
+    assert not threads()
 
 
 def test_everything_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,9 +107,7 @@ def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     assert "known header" in lines["mavlink"][1]
 
 
-def test_a_datalink_that_the_service_refuses_is_bad(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_datalink_that_the_service_refuses_is_bad(tmp_path: Path) -> None:
     assert "not encrypted" in findings("datalink.connect=tcp/192.0.2.1:7447")["datalink"][1]
     local = "datalink.connect=tcp/127.0.0.1:1"
     assert findings(local, "scan.drone=my drone")["datalink"][0] == BAD
@@ -99,13 +115,19 @@ def test_a_datalink_that_the_service_refuses_is_bad(
     for name in ("ca", "certificate", "key"):
         (tmp_path / name).touch()
         keys.append(f"datalink.tls_{name}={tmp_path / name}")
-    monkeypatch.setattr("os.access", lambda path, mode: path != str(tmp_path / "key"))
-    verdict, text = findings("datalink.connect=tls/127.0.0.1:1", *keys)["datalink"]
+    (tmp_path / "key").chmod(0)
+    found = bound_by_modes(lambda: findings("datalink.connect=tls/127.0.0.1:1", *keys))
+    verdict, text = found["datalink"]
     assert verdict == BAD and f"private key {tmp_path / 'key'} is not this user's" in text
 
 
+def open_soon(rest: str, options: Mapping[str, str]) -> CameraSource:
+    """As for a flight, but without its patience."""
+    return open_rtmp_listen(rest, options, LiveConfig(open_s=0.2))
+
+
 def test_a_camera_that_listens_waits_for_a_sender(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.cameras.live.OPEN_S", 0.2)
+    monkeypatch.setitem(CAMERAS, "rtmp-listen", f"{__name__}:open_soon")
     source = f"rtmp-listen:127.0.0.1:{free_port()}/live"
     verdict, text = findings(f"camera.source={source}")["camera"]
     assert verdict == NOTE and "waits for a sender" in text
@@ -188,21 +210,36 @@ def test_the_boards_settings_are_compared() -> None:
     assert reported[0] == NOTE
 
 
-def test_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.commands.diagnosis.is_warm", lambda: True)
-    assert findings()["kernels"][0] == GOOD
+def test_kernels_are_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def found() -> Grade:
+        _, kernels = examine_compute(load_config(None, ["compute.backend=cpu"]))
+        return kernels.verdict
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert found() == NOTE
+    (tmp_path / f"{MARKER}-{Path(sys.prefix).name}").write_text(software())
+    assert found() == GOOD
 
 
 def test_kernels_that_cannot_be_loaded_are_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "recon.stereo.belief_propagation", None)
+    kernels = "recon.stereo.belief_propagation"
+    monkeypatch.setitem(sys.modules, kernels, None)
     (found,) = examine_compute(load_config(None, ["compute.backend=cpu"]))
     assert found.verdict == BAD and "belief_propagation" in found.text
 
-    def fails(_: str) -> None:
-        raise RuntimeError("cannot cache function 'aggregate': no locator available")
+    class Uncached:
+        """Finds the kernels, but numba has no place for what it compiles."""
 
-    monkeypatch.setattr(diagnosis, "import_module", fails)
-    (found,) = examine_compute(load_config(None, ["compute.backend=cpu"]))
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == kernels:
+                raise RuntimeError("cannot cache function 'aggregate': no locator available")
+
+    monkeypatch.delitem(sys.modules, kernels)
+    sys.meta_path.insert(0, uncached := Uncached())
+    try:
+        (found,) = examine_compute(load_config(None, ["compute.backend=cpu"]))
+    finally:
+        sys.meta_path.remove(uncached)
     assert found.verdict == BAD and "no locator" in found.text
 
 

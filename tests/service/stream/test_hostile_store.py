@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from file_modes import bound_by_modes
 from house_flight import HouseFlight
 
 from service.errors import InputError, OutsideError
@@ -120,15 +120,20 @@ def test_a_keyframe_under_another_number_is_not_shown(path: Path) -> None:
         assert store.keyframe(1) is None
 
 
-def test_a_scan_on_a_disk_that_cannot_be_written_is_read(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scan_on_a_disk_that_cannot_be_written_is_read(path: Path) -> None:
+    def read() -> None:
+        with ScanStore.open(path) as store:
+            assert len(list(store.keyframes())) == 5 and store.finished
+            with pytest.raises(OutsideError, match="readonly"):
+                store.finish({})
+
     before = path.read_bytes()
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    with ScanStore.open(path) as store:
-        assert len(list(store.keyframes())) == 5 and store.finished
-        with pytest.raises(OutsideError, match="readonly"):
-            store.finish({})
+    path.chmod(0o400)
+    path.parent.chmod(0o500)
+    try:
+        bound_by_modes(read)
+    finally:
+        path.parent.chmod(0o700)
     assert path.read_bytes() == before
 
 
