@@ -112,7 +112,7 @@ class Localiser:
         reason, best = "no match", None
         least = MIN_TRACKS
         most = None if low_frame_rate else TRACKED_LANDMARKS
-        for key, T_camera_odom, share, by_features in self._starts(new, keyframes, motion, lost):
+        for key, T_camera_odom, share, by_features in self.starts(new, keyframes, motion, lost):
             left = keyframes[-2] if len(keyframes) > 1 and key is keyframes[-1] else None
             found = self.pose_from(key, new, T_camera_odom, share, least, most, left)
             if isinstance(found, str):
@@ -217,7 +217,7 @@ class Localiser:
                 return view
         return two_view.solve(uv_a, uv_b, K, None, np.pi, up)
 
-    def _starts(
+    def starts(
         self,
         new: Frame,
         keyframes: Sequence[Frame],
@@ -289,7 +289,7 @@ class Localiser:
         """
         radius_px = share * self.camera.size_px[0]
         amount = most if most is None or left is None else most * 2 // 3
-        uv, ok, searched, in_view = self._search(key, new, T_camera_odom, radius_px, amount)
+        uv, ok, searched, in_view = self.search(key, new, T_camera_odom, radius_px, amount)
         if np.count_nonzero(searched) < least:
             return "no known landmark is in view"
         known = key.landmarks.known(key.landmark)
@@ -298,7 +298,7 @@ class Localiser:
         expected = np.count_nonzero(searched & known)
         if most is not None and left is not None:
             taken = key.landmark[searched]
-            more = self._search(left, new, T_camera_odom, radius_px, most // 3, taken)
+            more = self.search(left, new, T_camera_odom, radius_px, most // 3, taken)
             also = np.flatnonzero(more[1])  # all that are searched have a landmark
             points = np.vstack([points, left.landmarks[left.landmark[also]]])
             pixels = np.vstack([pixels, more[0][also]])
@@ -313,7 +313,7 @@ class Localiser:
         found_share = float(ok[searched].mean())
         return Located(key, solved, uv, ok, in_view * found_share, found_share)
 
-    def _search(
+    def search(
         self,
         key: Frame,
         new: Frame,

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,12 @@ from recon.pipeline.mapper import (
     FramePosed,
     KeyframeReady,
     Mapper,
-    MapperConfig,
     PosesChanged,
     Reconstructed,
     moved,
 )
 from recon.pipeline.views import StereoView, ViewSelection
+from recon.tracking.adjusted_track import AdjustedTrack
 from recon.tracking.frame import Frame, Tracking
 from recon.types import Camera, DepthMap, Keyframe, Pose, PosePrior
 
@@ -116,19 +115,19 @@ def test_lists_are_no_camera_model() -> None:
         Mapper(Camera(CAMERA.K.tolist(), CAMERA.distortion, CAMERA.size_px))
 
 
-def test_no_frame_comes_between_the_two_numbers_of_a_spacing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_no_frame_comes_between_the_two_numbers_of_a_spacing() -> None:
     """Another thread sets them: every fifth frame follows every two metres."""
-    mapper, are_auto = Mapper(CAMERA, MapperConfig(spacing_m=2.0)), list[bool]()
+    mapper, steps = Mapper(CAMERA), list[float]()
 
-    def watched(one: ViewSelection, name: str, value: object) -> None:
-        object.__setattr__(one, name, value)
-        are_auto.append(one._is_auto)
+    class Watched(ViewSelection):
+        def __setattr__(self, name: str, value: object) -> None:
+            super().__setattr__(name, value)
+            if self is mapper.views.selection:
+                steps.append(self.frames_per_step)
 
-    monkeypatch.setattr(ViewSelection, "__setattr__", watched)
+    mapper.views.selection = Watched(2.0)
     mapper.set_spacing(0.0, 5)
-    assert are_auto == [False]
+    assert steps == [np.inf]  # no moment at which base to height decides
 
 
 class BrokenOff:
@@ -158,25 +157,26 @@ def test_only_keyframes_that_came_are_corrected() -> None:
     assert list(changed.poses) == [1] and len(mapper.cloud()) > 0
 
 
-def test_a_keyframe_does_not_wait_for_the_next_frame_that_is_looked_at(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    mapper = Mapper(CAMERA, worker=BrokenOff)
-    monkeypatch.setattr(mapper.odometry, "can_skip", lambda *_: True)
+class Hovering(AdjustedTrack):
+    """No frame need be looked at."""
+
+    def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
+        return True
+
+
+def test_a_keyframe_does_not_wait_for_the_next_frame_that_is_looked_at() -> None:
+    mapper = Mapper(CAMERA, known=Hovering({}, CAMERA, 0.0), worker=BrokenOff)
     ready, changed, skipped = mapper.skip(5, 0, PosePrior())
     assert isinstance(ready, KeyframeReady) and isinstance(changed, PosesChanged)
     assert isinstance(skipped, FramePosed) and skipped.frame.seq == 5
 
 
-def test_a_keyframe_does_not_wait_until_the_track_is_found_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_keyframe_does_not_wait_until_the_track_is_found_again() -> None:
     mapper = Mapper(CAMERA, worker=BrokenOff)
-    lose = partial(replace, state=Tracking.LOST)
-    monkeypatch.setattr(mapper.odometry, "track", lambda frame: [lose(frame)])
-    ready, changed, lost = mapper.track(Frame(np.zeros((60, 80, 3), np.uint8), 0, 5, PosePrior()))
+    ready, changed, lost = mapper.track(Frame(IMAGE, 0, 5, PosePrior()))
     assert isinstance(ready, KeyframeReady) and isinstance(changed, PosesChanged)
     assert isinstance(lost, FramePosed) and lost.frame.seq == 5
+    assert lost.frame.state is Tracking.LOST
 
 
 def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:
@@ -214,4 +214,7 @@ def test_a_first_depth_is_said_and_becomes_no_part_of_the_map() -> None:
     mapper = Mapper(CAMERA, worker=FirstOnly)
     (event,) = mapper.drain()
     assert isinstance(event, KeyframeReady) and event.is_first_depth
-    assert len(mapper.cloud()) == 0 and not mapper.frames._views
+    assert len(mapper.cloud()) == 0
+    frame = view_at(9, np.eye(4)).frame
+    pose = mapper.frames.place(frame)
+    assert pose is not None and pose.sources == ("vision",) and not pose.is_aligned

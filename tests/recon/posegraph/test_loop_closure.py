@@ -363,18 +363,16 @@ def test_a_lost_stretch_is_found_by_its_look_among_many() -> None:
     assert apart_m(search, poses, 2, 13) < 0.3
 
 
-def test_after_a_loop_the_search_waits_until_the_view_has_moved_on(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_after_a_loop_the_search_waits_until_the_view_has_moved_on() -> None:
     """For a quarter of the view's diagonal, or three keyframes."""
     seen, trajectory, searched = view(A, 1), Trajectory(), list[int]()
-    search = LoopSearch(trajectory)
 
-    def takes_a_loop(new: Any) -> None:
-        searched.append(new.seq)
-        search._tied = new
+    class TakesALoop(LoopSearch):
+        def _search(self, new: Any) -> None:
+            searched.append(new.seq)
+            self._tied = new
 
-    monkeypatch.setattr(search, "_search", takes_a_loop)
+    search = TakesALoop(trajectory)
     H, W = seen.gray.shape
     diagonal_m = float(np.nanmedian(seen.depth.depth_m)) * float(np.hypot(W, H)) / K[0, 0]
     for i, share in enumerate((0.0, 0.1, 0.2, 0.3, 0.31, 0.32, 0.33, 0.34)):

@@ -13,9 +13,10 @@ import pytest
 from tracked_frame import undistorted
 
 from recon import se3
+from recon.rolling_shutter import RowTrack
 from recon.tracking import matching
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
-from recon.tracking.localisation import TRACKED_LANDMARKS, Localiser
+from recon.tracking.localisation import MIN_TRACKS, SEARCH_SHARE, TRACKED_LANDMARKS, Localiser
 from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Bool, Camera, PosePrior, Shutter
 from service.config import ScanConfig
@@ -277,25 +278,48 @@ def test_it_takes_what_the_configuration_may_ask_for() -> None:
             Odometry(CAMERA, base_to_height=step)
 
 
-def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPatch) -> None:
-    searched: list[tuple[int, bool, set[int]]] = []
-    search = Localiser._search
+def test_each_landmark_is_searched_once(ground: U8) -> None:
+    """In two keyframes, for the pose of a frame between keyframes."""
+    searched: list[set[int]] = []
 
-    def spy(self: Localiser, key: Frame, *rest: Any) -> Any:
-        found = search(self, key, *rest)
-        is_tracked = rest[3] is not None
-        searched.append((key.seq, is_tracked, set(key.landmark[found[2]].tolist())))
-        return found
+    class Watched(Localiser):
+        def search(self, key: Frame, *rest: Any) -> Any:
+            found = super().search(key, *rest)
+            searched.append(set(key.landmark[found[2]].tolist()))
+            return found
 
-    monkeypatch.setattr(Localiser, "_search", spy)
-    fly(ground, poses(24, step_m=0.8), telemetry=True)
-    pairs = 0
-    for (right, first, a), (left, second, b) in pairwise(searched):
-        if first and second and left < right:
+    track = poses(24, step_m=0.8)
+    odometry, out = fly(ground, track, telemetry=True)
+    localiser, pairs = Watched(CAMERA, RowTrack(CAMERA)), 0
+    for left, key in pairwise(odometry.keyframes):
+        for n in range(key.seq + 1, min(key.seq + 4, len(track))):
+            new = undistorted(photograph(ground, track[n]), n, out[n].time_ns, out[n].prior)
+            start = se3.inverse(out[n].T_odom_camera)
+            searched.clear()
+            found = localiser.pose_from(
+                key, new, start, SEARCH_SHARE, MIN_TRACKS, TRACKED_LANDMARKS, left
+            )
+            assert not isinstance(found, str)
+            a, b = searched
             pairs += 1
-            assert a and not a & b
-            assert len(a | b) <= 1.5 * TRACKED_LANDMARKS
+            assert a and b and not a & b
+            assert len(a | b) < 2 * TRACKED_LANDMARKS  # every other one at most is left out
     assert pairs > 5
+
+
+def test_a_frame_that_shows_a_few_of_the_landmarks_is_not_placed_by_them(ground: U8) -> None:
+    """More than a pose takes, and of those in view too few."""
+    track, elsewhere = poses(8), photograph(ground, poses(40)[39])
+    odometry, out = fly(ground, track, telemetry=True)
+    key, last, localiser = odometry.keyframes[-1], out[-1], Localiser(CAMERA, RowTrack(CAMERA))
+    start, radius_px = se3.inverse(last.T_odom_camera), SEARCH_SHARE * CAMERA.size_px[0]
+    for shown_px, is_placed in ((480, True), (96, False)):
+        image = photograph(ground, track[-1])
+        image[:, shown_px:] = elsewhere[:, shown_px:]
+        new = undistorted(image, 9, last.time_ns, last.prior)
+        assert localiser.search(key, new, start, radius_px, None)[1].sum() > 2 * MIN_TRACKS
+        found = localiser.pose_from(key, new, start, SEARCH_SHARE, MIN_TRACKS)
+        assert (found == "too few matches") != is_placed
 
 
 def test_a_few_landmarks_show_where_the_others_are(

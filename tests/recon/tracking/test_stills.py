@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,10 +16,13 @@ from tracked_frame import undistorted
 from recon.backends import load_backend
 from recon.camera_model import scaled
 from recon.pipeline.mapper import Event, FramePosed
+from recon.rolling_shutter import RowTrack
 from recon.tracking.frame import Frame, Tracking
 from recon.tracking.localisation import Localiser, Located, Start
 from recon.tracking.odometry import Odometry
-from recon.types import F64, U8, PosePrior
+from recon.tracking.pnp import PnpResult
+from recon.tracking.prediction import ConstantVelocity
+from recon.types import F64, U8, PosePrior, Shutter
 from service.config import load_config
 from service.flight.pipeline import Pipeline
 
@@ -122,46 +124,46 @@ def test_two_views_bridge_what_has_no_landmarks() -> None:
 
 
 @pytest.mark.slow
-def test_stills_whose_corners_differ_are_tied_by_their_features(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stills_whose_corners_differ_are_tied_by_their_features() -> None:
     """Treetops: each still has leaves of its own on the masses that it shares."""
-    with_features, counts = Localiser.with_features, []
-
-    def twice(self: Localiser, new: Any, key: Any, uv: F64, ok: Any) -> Any:
-        found = with_features(self, new, key, uv, ok)
-        assert found is not None
-        before, count = key.uv, len(uv)
-        again = with_features(self, new, key, *found)
-        assert again is not None
-        np.testing.assert_array_equal(key.uv, before)  # a place that is there is not added again
-        np.testing.assert_array_equal(again[1], found[1])
-        counts.append(len(before) - count)
-        return again
-
-    monkeypatch.setattr(Localiser, "with_features", twice)
     camera = scaled(CAMERA, (960, 720))
     odometry, prior = Odometry(camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
-    track, found = [pose(0.3 * FOOTPRINT_M * (i - 2), seed=i) for i in range(4)], []
+    track, found = [pose(0.3 * FOOTPRINT_M * (i - 2), seed=i) for i in range(4)], list[Frame]()
     for i, T in enumerate(track):
-        noise = np.random.default_rng(i).normal(size=camera.size_px[::-1])
-        leaves = np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.7))
-        image = np.clip(still(T, camera) + 20.0 * leaves / leaves.std(), 0, 255).astype(np.uint8)
-        found += odometry.track(undistorted(image, i, i * 2_000_000_000, prior))
+        key = odometry.keyframes[-1] if i else None
+        count = 0 if key is None else len(key.uv)
+        new = undistorted(with_leaves(still(T, camera), i), i, i * 2_000_000_000, prior)
+        found += odometry.track(new)
+        assert key is None or len(key.uv) - count > 80
     assert_one_piece(track, found, 0.005)
-    assert min(counts) > 80
+    assert key is not None
+    localiser, before = Localiser(camera, RowTrack(camera)), key.uv
+    there = localiser.with_features(new, key, key.uv, np.zeros(len(key.uv), np.bool_))
+    assert there is not None and there[1].sum() > 80
+    np.testing.assert_array_equal(key.uv, before)  # a place that is there is not added again
+    again = localiser.with_features(new, key, *there)
+    assert again is not None
+    np.testing.assert_array_equal(again[1], there[1])
+
+
+def with_leaves(image: U8, seed: int) -> U8:
+    """The image under corners of its own."""
+    noise = np.random.default_rng(seed).normal(size=image.shape)
+    leaves = np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.7))
+    return np.asarray(np.clip(image + 20.0 * leaves / leaves.std(), 0, 255), np.uint8)
 
 
 def test_frames_that_wait_are_placed_though_features_follow_the_corners_since() -> None:
-    odometry, prior = Odometry(CAMERA), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
-    odometry.track(undistorted(still(pose(0.0)), 0, 0, prior))
-    first = odometry.keyframes[0]
-    seen = np.zeros(len(first.uv), np.bool_)
-    odometry._early = [(first.row_motion, first.uv, seen)]
-    first.uv = np.vstack([first.uv, first.uv[:5] + 0.5])
-    first.landmark = np.concatenate([first.landmark, np.full(5, -1, np.int64)])
-    odometry._place_early(first)
-    assert odometry._early == []
+    """A camera with a known readout hovers under a canopy, and comes again as a still."""
+    camera = replace(scaled(CAMERA, (960, 720)), shutter=Shutter(0.02))
+    odometry, prior = Odometry(camera, camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
+    shots = [(0.0, 0, 0), (0.1, 0, 40_000_000), (0.3 * FOOTPRINT_M, 1, 2_000_000_000)]
+    found = list[Frame]()
+    for i, (east_m, leaves, time_ns) in enumerate(shots):
+        image = with_leaves(still(pose(east_m), camera), leaves)
+        found += odometry.track(undistorted(image, i, time_ns, prior))
+    assert [one.state for one in found] == ["started", "waiting", "keyframe"]
+    assert len(odometry.keyframes[0].uv) > len(found[0].uv)
 
 
 @pytest.mark.slow
@@ -227,34 +229,29 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
     assert pipeline.mapper.refusals().total() == 0
 
 
-@pytest.mark.slow
-def test_corners_without_a_landmark_do_not_choose_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+class TwoStarts(Localiser):
+    """Of two starts in one keyframe the first is matched by more corners, the second explained by
+    more landmarks."""
+
+    def starts(self, new: Frame, keyframes: Sequence[Frame], *_: object) -> Iterator[Start]:
+        for share in (OFF, 2.0 * OFF):
+            yield keyframes[-1], np.eye(4), share, False
+
+    def pose_from(
+        self, key: Frame, new: Frame, T_camera_odom: F64, share: float, *_: object
+    ) -> Located:
+        is_off = share == OFF
+        explained = np.arange(90) < (30 if is_off else 80)
+        solved = PnpResult(T_camera_odom, np.eye(6), explained, 0.5)
+        return Located(key, solved, np.zeros((90, 2)), explained | is_off, 1.0, share)
+
+
+def test_corners_without_a_landmark_do_not_choose_the_pose() -> None:
     """Of two starts the one whose pose explains more landmarks wins, however many corners match."""
-    track = [pose(0.3 * FOOTPRINT_M * (i - 3), seed=i) for i in range(6)]
-    starts_of, pose_from, locate_of = Localiser._starts, Localiser.pose_from, Localiser.locate
-    chosen: list[Located | str] = []
-
-    def starts(self: Localiser, *arguments: Any) -> Iterator[Start]:
-        for start in starts_of(self, *arguments):
-            yield (*start[:2], -1.0, start[3])  # marks the first of the two
-            yield start
-
-    def found(self: Localiser, key: Any, new: Any, T: F64, share: float, *rest: Any) -> Any:
-        out = pose_from(self, key, new, T, abs(share) if share > 0 else 0.09, *rest)
-        if share > 0 or not isinstance(out, Located):
-            return out
-        few = out.pose.inliers.copy()
-        few[len(few) // 3 :] = False
-        off = replace(out.pose, inliers=few)
-        return replace(out, pose=off, ok=np.ones_like(out.ok), found_share=OFF)
-
-    def locate(self: Localiser, *arguments: Any, **named: Any) -> Located | str:
-        chosen.append(locate_of(self, *arguments, **named))
-        return chosen[-1]
-
-    monkeypatch.setattr(Localiser, "_starts", starts)
-    monkeypatch.setattr(Localiser, "pose_from", found)
-    monkeypatch.setattr(Localiser, "locate", locate)
-    flown([still(T) for T in track])
-    placed = [one for one in chosen if isinstance(one, Located)]
-    assert len(placed) >= 3 and all(one.found_share != OFF for one in placed)
+    nowhere = undistorted(np.zeros(SIZE[::-1], np.uint8), 0, 0, PosePrior())
+    motion = ConstantVelocity(0, np.eye(4), PosePrior())
+    localiser = TwoStarts(CAMERA, RowTrack(CAMERA))
+    found = localiser.locate(nowhere, [nowhere], motion, low_frame_rate=True, lost=False)
+    assert isinstance(found, Located) and found.found_share != OFF and found.explained == 80
+    first = localiser.locate(nowhere, [nowhere], motion, low_frame_rate=False, lost=False)
+    assert isinstance(first, Located) and first.found_share == OFF  # of video it is taken at once
