@@ -6,6 +6,7 @@ no broken text reaches the list.
 
 from __future__ import annotations
 
+import stat
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -117,8 +118,9 @@ def is_current(product: Path) -> bool:
     ``scan.json``."""
     summary = product.with_name(SUMMARY)
     with suppress(OSError):  # it is replaced or deleted meanwhile
-        if is_regular(product):
-            return not summary.exists() or product.stat().st_mtime >= summary.stat().st_mtime
+        made = product.lstat()
+        if stat.S_ISREG(made.st_mode):
+            return not summary.exists() or made.st_mtime >= summary.stat().st_mtime
     return False
 
 

@@ -85,6 +85,7 @@ def fused_cloud(
     box: Box = EVERYWHERE,
     strip_points: int = STRIP_POINTS,
     largest_points: int = LARGEST_POINTS,
+    min_strip_points: int = MIN_STRIP_POINTS,
 ) -> FusedCloud:
     """The main piece of ``store`` fused; voxels of the ground sample distance by default.
 
@@ -104,7 +105,7 @@ def fused_cloud(
         size *= float(np.sqrt(points / largest_points))
         notes = (f"{points} points before fusion: voxels enlarged to {size:.3f} m",)
     share = points // (STRIPS_PER_CORE * threads())
-    edges = strip_edges(extents, min(strip_points, max(share, MIN_STRIP_POINTS)))
+    edges = strip_edges(extents, min(strip_points, max(share, min_strip_points)))
     with progress.part("fusing the cloud", 0.5):
         say = partial(progress.counting(len(extents)), progress.text)
         within = [_inside(extents, *ends) for ends in pairwise(edges)]

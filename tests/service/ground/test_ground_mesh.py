@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 import time
 import zipfile
 from pathlib import Path
@@ -153,12 +154,26 @@ def test_a_mesh_stays_that_of_its_scan_when_it_is_imported(folder: Path, tmp_pat
     assert not older.entry(*older.take(folder))["meshed"]
 
 
-def test_a_mesh_that_is_deleted_while_the_library_is_read_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mesh_that_is_deleted_while_the_library_is_read_is_none(tmp_path: Path) -> None:
+    mesh, ended = tmp_path / "mesh.glb", threading.Event()
     (tmp_path / "scan.json").touch()
-    monkeypatch.setattr("service.ground.scan_facts.is_regular", lambda _: True)  # it was there
-    assert not is_current(tmp_path / "mesh.glb")
+    assert not is_current(mesh)
+
+    def come_and_go() -> None:
+        while not ended.is_set():
+            mesh.touch()
+            mesh.unlink()
+
+    coming = threading.Thread(target=come_and_go)
+    coming.start()
+    try:
+        assert {is_current(mesh) for _ in range(2000)} <= {True, False}
+    finally:
+        ended.set()
+        coming.join()
+    (tmp_path / "other.glb").touch()
+    mesh.symlink_to("other.glb")
+    assert not is_current(mesh)
 
 
 class FullDisk:

@@ -308,10 +308,9 @@ def test_a_large_site_is_fused_strip_by_strip_to_the_same_cloud(
 def test_fusion_decodes_a_keyframe_for_its_points_and_for_what_it_sees(
     tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.scans.fused_cloud.MIN_STRIP_POINTS", 1)
     with house.flown(tmp_path) as store:
         decoded = spied(monkeypatch, store, "keyframe")
-        fused_cloud(store)
+        fused_cloud(store, min_strip_points=1)
         assert Counter(call.args[0] for call in decoded.call_args_list) == dict.fromkeys(
             store.seqs(), 2
         )
