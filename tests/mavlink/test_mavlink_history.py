@@ -598,4 +598,7 @@ def test_a_live_history_forgets() -> None:
     for k in range(2000):
         history.add(AttitudeSample(None, IDENTITY), T0 + k * 10 * MS)
     assert len(history) < 700
+    before = len(history)
+    history.add(PositionSample(None, 47.4, 8.5, 550.0, 100.0, None), T0 + 20 * S)
+    assert len(history) == before + 1  # samples of all kinds
     assert history.state_at(T0 + 19 * S) is not None

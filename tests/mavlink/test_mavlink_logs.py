@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import math
 import random
 import re
 import struct
 import tempfile
+import threading
+import time
 import tracemalloc
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, replace
@@ -22,9 +23,9 @@ from paths import DATA, SHARED
 from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry import quaternion
-from mavlink.telemetry.decode import READERS, plausible_place
+from mavlink.telemetry.decode import READERS
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, dataflash, load_telemetry, ulog
+from mavlink.telemetry.logs import TelemetryLog, load_telemetry
 from mavlink.telemetry.samples import F64
 from mavlink.wire.dialect import dialect
 
@@ -617,27 +618,28 @@ def test_damage_of_an_onboard_log_is_counted_in_one_line(
 
 
 def test_what_others_print_while_a_log_is_read_is_shown(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Only the readers of logs are silenced, not the process."""
     path = tmp_path / "log.BIN"
     path.write_bytes(dataflash_flight(True).data)
+    for log in (path, shared("flight_logs/px4_auav_x21_68s.ulg")):
+        said, is_reading = [0], [True]
 
-    class Loud(io.BufferedReader):
-        def read(self, size: int | None = -1, /) -> bytes:
-            print("another thread")
-            return super().read(size)
+        def speak(said: list[int] = said, is_reading: list[bool] = is_reading) -> None:
+            while is_reading[0]:
+                print("another thread")
+                said[0] += 1
+                time.sleep(0.001)
 
-    def plausible(*place: float) -> bool:
-        print("another thread")
-        return plausible_place(*place)
-
-    monkeypatch.setattr(dataflash, "plausible_place", plausible)
-    load_telemetry(path)
-    assert "another thread" in capfd.readouterr().out
-    monkeypatch.setattr(ulog, "_LimitedFile", lambda path: Loud(io.FileIO(path)))
-    load_telemetry(shared("flight_logs/px4_auav_x21_68s.ulg"))
-    assert "another thread" in capfd.readouterr().out
+        speaking = threading.Thread(target=speak)
+        speaking.start()
+        before = said[0]
+        load_telemetry(log)
+        during = said[0] - before
+        is_reading[0] = False
+        speaking.join()
+        assert during > 0 and capfd.readouterr().out.count("another thread") == said[0]
 
 
 def test_a_damaged_time_of_an_onboard_log_costs_its_message_only(tmp_path: Path) -> None:

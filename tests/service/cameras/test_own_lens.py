@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +41,10 @@ def bent_images(count: int) -> Iterator[U8]:
         yield np.asarray(bent, np.uint8)
 
 
-def stills(folder: Path, count: int) -> Path:
+def stills(folder: Path, images: Iterable[U8]) -> Path:
     """The images as JPEG files with a focal length."""
     folder.mkdir()
-    for k, bent in enumerate(bent_images(count)):
+    for k, bent in enumerate(images):
         tags = Image.Exif()
         tags.get_ifd(0x8769)[41989] = EXIF_FOCAL
         Image.fromarray(bent).convert("RGB").save(folder / f"{k:02d}.jpg", quality=97, exif=tags)
@@ -89,7 +89,7 @@ def test_the_lens_of_a_video_is_found(tmp_path: Path, wanted: bool) -> None:
 @pytest.mark.parametrize("wanted", [True, False])
 @pytest.mark.slow
 def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted: bool) -> None:
-    folder = stills(tmp_path / "stills", 10)
+    folder = stills(tmp_path / "stills", bent_images(10))
     more = [] if wanted else ["--no-find-lens"]
     figures, camera = replayed(f"images:{folder}", tmp_path / "scan", *more)
     notes = figures["warnings"]
@@ -107,21 +107,21 @@ def test_a_lens_that_the_images_do_not_determine_is_reported(
         raise InputError("the camera found is too far from the model given")
 
     monkeypatch.setattr("service.offline.refine.refinement.lens", refuse)
-    figures, _ = replayed(f"images:{stills(tmp_path / 'stills', 6)}", tmp_path / "scan")
+    folder = stills(tmp_path / "stills", bent_images(6))
+    figures, _ = replayed(f"images:{folder}", tmp_path / "scan")
     assert "distortion" in figures["assumed"]
     assert any("the camera found is too far" in note for note in figures["warnings"])
 
 
-def test_images_that_place_no_camera_determine_no_lens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("service.flight.scan.Scan.run", lambda *_, **__: None)
-    figures, _ = replayed(f"images:{stills(tmp_path / 'stills', 6)}", tmp_path / "scan")
+def test_images_that_place_no_camera_determine_no_lens(tmp_path: Path) -> None:
+    gray = [np.full(SIZE[::-1], 90 + k, np.uint8) for k in range(6)]
+    folder = stills(tmp_path / "stills", gray)
+    figures, _ = replayed(f"images:{folder}", tmp_path / "scan")
     reason = "the images do not determine their lens: 0 keyframes are too few; 3 needed"
     assert reason in figures["warnings"]
 
 
 def test_the_stills_about_the_middle(tmp_path: Path) -> None:
-    source = open_images(str(stills(tmp_path / "stills", 6)), {})
+    source = open_images(str(stills(tmp_path / "stills", bent_images(6))), {})
     assert [image.name for image in source.middle(3)] == ["01.jpg", "02.jpg", "03.jpg"]
     assert source.middle(9).images == source.images == 6

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
+import signal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_line import skyrelief
+from command_line import command_process, skyrelief
 from house_flight import HouseFlight
+from loopback import until
 
 from recon.types import Camera
 from service.cameras.camera_file import save_camera
@@ -55,16 +57,16 @@ def test_replay_refuses_a_view_that_is_too_narrow(tmp_path: Path) -> None:
     assert "the view is 1.4 degrees wide" in ended.stderr
 
 
-def test_a_stopped_simulation_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stopped(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("service.sim.recording.write_video", stopped)
-    few = ("--duration-s", "1", "--fps", "1", "--size", "64x64", "--density", "0")
-    skyrelief("simulate", "--out", tmp_path / "flight", *few)
-    assert list(tmp_path.iterdir()) == []
+def test_a_stopped_simulation_leaves_nothing(tmp_path: Path) -> None:
+    place = tmp_path / "place"
+    place.mkdir()
+    long = ("--duration-s", "20", "--fps", "30", "--size", "64x64", "--density", "0")
+    command = ("simulate", "--out", str(place / "flight"), *long)
+    with command_process(tmp_path / "log", *command) as simulating:
+        assert until(lambda: [*place.rglob("*.mp4")], 120.0)
+        simulating.send_signal(signal.SIGINT)
+        assert simulating.wait(120.0) != 0
+    assert list(place.iterdir()) == []
 
 
 def test_a_refused_refinement_leaves_no_folder(scan: Path, tmp_path: Path) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -20,7 +23,6 @@ from typer.testing import CliRunner
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView
-from service.cameras import CameraFrame, CameraSource
 from service.cli import app
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
@@ -177,50 +179,41 @@ def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> No
     assert uses.count(34963) == figures["tiles"] and uses.count(None) == len(tree["images"])
 
 
-class FakeVideo(CameraSource):
-    """Images twice as fine as the keyframes', one of them at each keyframe's second."""
-
-    def __init__(self, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> None:
-        super().__init__("video")
-        self.size_px, self.fps, self.closed = size_px, 2.0, False
-        self._house = house
-
-    def __iter__(self) -> Iterator[CameraFrame]:
+def filmed(path: Path, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> Path:
+    """A video without losses, twice as fine as the keyframes, one image at each one's second."""
+    with av.open(str(path), "w", format="matroska") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = *size_px, "yuv420p"
         for n in range(9):
-            big = cv2.resize(
-                self._house.keyframe(n // 2, 2.5 * n).bgr,
-                self.size_px,
-                interpolation=cv2.INTER_AREA,
-            )
-            yield CameraFrame(np.asarray(big, np.uint8), n * 500_000_000, n, None, f"frame {n}")
-
-    def close(self) -> None:
-        self.closed = True
+            seen = house.keyframe(n // 2, 2.5 * n).bgr
+            big = cv2.resize(seen, size_px, interpolation=cv2.INTER_AREA)
+            frame = av.VideoFrame.from_ndarray(np.asarray(big, np.uint8), format="bgr24")
+            frame.pts, frame.time_base = 5 * n, Fraction(1, 10)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
 
 
-@pytest.fixture
-def videos(monkeypatch: pytest.MonkeyPatch) -> list[FakeVideo]:
-    """The last one is what every recording opens as."""
-    given: list[FakeVideo] = []
-    monkeypatch.setattr(images, "open_camera", lambda _: given[-1])
-    return given
+def is_open(path: Path) -> bool:
+    """Whether this process holds the file."""
+    return any(one.resolve() == path for one in Path("/proc/self/fd").iterdir())
 
 
 def test_images_come_from_the_video_at_the_keyframes_times(
-    tmp_path: Path, house: HouseFlight, videos: list[FakeVideo]
+    tmp_path: Path, house: HouseFlight
 ) -> None:
+    video = filmed(tmp_path / "flight.mkv", house)
     with house.flown(tmp_path) as store:
         keyframes = list(store.keyframes())
         K = np.array([[280.0, 0, 159.5], [0, 280.0, 89.5], [0, 0, 1]])
         camera = {"K": K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
-    videos.append(video := FakeVideo(house))
 
     def views_of(header: ScanHeader, epoch_ns: int | None = None, **how: Any) -> list[TextureView]:
-        return images.video_images(keyframes, header, tmp_path, epoch_ns, **how)
+        return images.video_images(keyframes, header, video, epoch_ns, **how)
 
     views = views_of(header)
-    assert len(views) == 5 and video.closed
+    assert len(views) == 5 and not is_open(video)
     for view, keyframe in zip(views, keyframes, strict=True):
         assert view.bgra.shape == (180, 320, 4) and (view.bgra[..., 3] == 255).all()
         np.testing.assert_array_equal(view.T_world_camera, keyframe.depth.T_world_camera)
@@ -234,7 +227,7 @@ def test_images_come_from_the_video_at_the_keyframes_times(
         views_of(header, 0)
     with pytest.raises(InputError, match="no camera model"):
         views_of(replace(header, camera={}))
-    videos.append(FakeVideo(house, (640, 360)))
+    filmed(video, house, (640, 360))
     with pytest.raises(InputError, match="640x360"):
         views_of(header)
 
@@ -264,14 +257,11 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
     assert isinstance(failed.exception, InputError)
 
 
-def test_the_recording_that_a_scan_names_is_found(
-    tmp_path: Path, house: HouseFlight, videos: list[FakeVideo]
-) -> None:
+def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFlight) -> None:
     folder = tmp_path / "scan"
     with house.flown(folder) as store:
         camera = {"K": [1.0] * 9, "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
-    videos.append(FakeVideo(house, (320, 180)))
 
     def found() -> images.Recording:
         return images.recording_of(folder, header)
@@ -283,8 +273,7 @@ def test_the_recording_that_a_scan_names_is_found(
         return found()
 
     assert name("flight.mp4").path is None and "is not there" in name("flight.mp4").words
-    video = tmp_path / "flight.mp4"
-    video.touch()
+    video = filmed(tmp_path / "flight.mp4", house)
     assert name("flight.mp4").path == video  # next to the scan folder
     assert name(str(video)).path == video
     for source in ("flight.mp4", str(video), "../flight.mp4"):
@@ -294,7 +283,7 @@ def test_the_recording_that_a_scan_names_is_found(
     (folder / "link.mp4").symlink_to(video)
     name("link.mp4")
     assert images.recording_of(folder, header, within=folder).path is None
-    (folder / "own.mp4").touch()
+    shutil.copy(video, folder / "own.mp4")
     for source in ("own.mp4", "flights/own.mp4", "/gone/own.mp4"):
         name(source)
         bounded = images.recording_of(folder, header, within=folder)
@@ -307,24 +296,25 @@ def test_the_recording_that_a_scan_names_is_found(
     assert "is not there" in name("x" * 5000).words
     (folder / "scan.json").write_text("[" * 100_000)
     assert "does not name" in found().words
-    videos.append(FakeVideo(house, (640, 360)))
+    filmed(video, house, (640, 360))
     assert name("flight.mp4").path is None and "another recording" in name("flight.mp4").words
     bare = replace(header, camera={})
     assert images.recording_of(folder, bare).path is None
 
 
 def test_a_recording_found_by_itself_that_does_not_fit_is_left(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, house: HouseFlight
 ) -> None:
-    """The scan names a file that is not a video: the mesh is made from the store, and says so."""
-    house.flown(tmp_path).close()
-    video = tmp_path / "none.mp4"
-    video.touch()
-    monkeypatch.setattr(images, "recording_of", lambda *_: images.Recording(video, ""))
+    """The scan names a video of another time: the mesh is made from the store, and says so."""
+    video = filmed(tmp_path / "flight.mkv", house)
+    camera = {"K": house.K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
+    with house.flown(tmp_path) as store:
+        store.update_header(camera=camera, started_unix_ns=store.header.started_unix_ns - 10**12)
+    (tmp_path / "scan.json").write_text(json.dumps({"run": {"source": str(video)}}))
     (job, *_), reported = jobs(tmp_path), list[str]()
     assert make_part(job, noting(reported)) is not None
     assert any("after all" in text for text in reported)
-    with pytest.raises(InputError, match="contains no camera model"):
+    with pytest.raises(InputError, match="no frame was taken at the time of a keyframe"):
         make_part(replace(job, options=ExportOptions(video=video)), noting(reported))
 
 
