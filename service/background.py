@@ -174,7 +174,6 @@ class BackgroundWorker(Generic[In, Out]):
         return out
 
     def _wait(self, future: Future[Out]) -> bool:
-        """Wait for work; False where it is dropped."""
         while not self._ends.is_set():
             if wait([future], LOOK_S).done:
                 return True

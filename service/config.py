@@ -261,7 +261,6 @@ class Config:
     health: HealthConfig = dataclasses.field(default_factory=HealthConfig)
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Sections of plain values, for JSON."""
         plain: dict[str, dict[str, Any]] = msgspec.to_builtins(self)
         return plain
 

@@ -59,7 +59,6 @@ def unusable_packages() -> dict[str, list[str]]:
 
 
 def loads(library: str) -> bool:
-    """True when the dynamic loader finds ``library`` (its soname)."""
     try:
         ctypes.CDLL(library)
     except OSError:

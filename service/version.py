@@ -6,7 +6,6 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def software() -> str:
-    """``skyrelief X.Y.Z``."""
     try:
         return f"skyrelief {version('skyrelief')}"
     except PackageNotFoundError:

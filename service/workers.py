@@ -42,8 +42,6 @@ DROP, WAIT = "drop oldest", "wait"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One kind of thread or process."""
-
     name: str  # name of its workers, or the first word of their names
     does: str
     stop: int = 0  # order of stopping: the lowest first
@@ -153,7 +151,6 @@ class Worker:
 
     @property
     def state(self) -> str:
-        """failed, done, stalled or running."""
         if self.has_failed:
             return "failed"
         if self.is_done:

@@ -72,7 +72,6 @@ class BenchResult:
         return self.value / self.peer_value if self.peer_value else None
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, with the ratio."""
         return asdict(self) | {"ratio": self.ratio}
 
 

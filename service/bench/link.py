@@ -40,8 +40,6 @@ PATIENCE_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial: scan and link."""
-
     link: LinkModel
     flight_s: float = 45.0
     keyframes_hz: float = 10.0
@@ -62,8 +60,6 @@ Row = tuple[str, float, str]
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of a trial."""
-
     delivered: int
     made: int
     busiest_share: float  # busiest second over the budget, on the wire

@@ -130,7 +130,6 @@ def fly(
 
 
 def resident_mib() -> float:
-    """Resident memory of this process now."""
     return float(psutil.Process().memory_info().rss) / 2**20
 
 

@@ -22,8 +22,6 @@ MAX_VIEWS = 80
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSet:
-    """Detected chessboards in images of one size."""
-
     views: tuple[BoardView, ...]
     missed: tuple[tuple[str, str], ...]  # (name, why the image is not used)
     size_px: tuple[int, int]  # (W, H)

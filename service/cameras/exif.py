@@ -378,7 +378,6 @@ def _degrees(value: Any) -> tuple[float, float] | None:
 
 
 def _step(value: Any) -> float:
-    """The unit of an EXIF rational."""
     return 1.0 / max(getattr(value, "denominator", 1), 1)
 
 

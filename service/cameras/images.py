@@ -112,7 +112,6 @@ class ImagesSource(CameraSource):
         self.fps = (len(self._stills) - 1) / span_s if span_s > 0 else None
 
     def __iter__(self) -> Iterator[CameraFrame]:
-        """Yield the stills that decode."""
         seq = 0
         for path, tags, time_ns in self._stills:
             image = self._load(path, tags)

@@ -258,7 +258,6 @@ def by_full_frame(focal_mm: float, size_px: tuple[int, int], sensor_aspect: floa
 
 
 def by_view(hfov_deg: float, size_px: tuple[int, int]) -> Lens:
-    """The lens of a field of view from side to side."""
     across = size_px[0] / max(size_px)
     return Lens(0.5 * across / math.tan(0.5 * math.radians(hfov_deg)))
 

@@ -249,7 +249,6 @@ class Paced(Relayed):
             reader.join(CLOSE_S)
 
     def _due(self) -> Generator[CameraFrame, None, None]:
-        """The images, each at its presentation time."""
         start = time.monotonic_ns()
         for frame in self._source:
             early_s = 1e-9 * (frame.time_ns - (time.monotonic_ns() - start))

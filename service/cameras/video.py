@@ -436,7 +436,6 @@ class PipeReader:
     """A read-only byte stream whose first bytes can be peeked."""
 
     def __init__(self, stream: BinaryIO) -> None:
-        """Wrap ``stream``; nothing is read yet."""
         self._stream = stream
         self._head = b""
 

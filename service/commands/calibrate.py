@@ -82,7 +82,6 @@ def calibrate(
 
 
 def result_text(report: dict[str, Any]) -> str:
-    """The report as lines for people."""
     K, d = report["K"], report["distortion"]
     lines = [
         f"rms {report['rms_px']:.3f} px over {len(report['views'])} views, "

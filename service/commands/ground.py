@@ -42,8 +42,6 @@ TokenFile = Annotated[
 
 @dataclass(frozen=True)
 class GroundOptions:
-    """Options of ``ground``, as they are given."""
-
     connect: Annotated[
         list[str] | None, typer.Option(help="router to join: tls/HOST:7447; may be repeated")
     ] = None

@@ -25,8 +25,6 @@ PAIR = re.compile(r"(-?(?:\d+\.?\d*|\.\d+)):(-?(?:\d+\.?\d*|\.\d+))", re.ASCII)
 
 @dataclass(frozen=True)
 class SimulateOptions:
-    """Options of ``simulate``, as they are given."""
-
     out: Annotated[Path, typer.Option(help="Folder for the flight and its truth.")]
     seed: Annotated[int, typer.Option(help="Seed of the site and of all random numbers.")] = 1
     duration_s: Annotated[float, typer.Option(help="Length of the video.")] = 30.0
@@ -189,7 +187,6 @@ def _play(given: SimulateOptions) -> None:
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:
-    """Two numbers of ``A:B``."""
     found = PAIR.fullmatch(text.strip())
     if found is None:
         raise InputError(f"{option} {text!r}: expected two numbers with a colon, such as 10:2.5")
@@ -255,7 +252,6 @@ def _text_of_views(report: dict[str, Any]) -> str:
 
 
 def _text(report: dict[str, Any]) -> str:
-    """The report as lines for people."""
     lines = [
         f"{report['points']} points, {report['poses_compared']} of {report['poses']} poses "
         f"compared, flown {report['altitude_m']:.1f} m above the ground"

@@ -24,8 +24,6 @@ class Files(Enum):
 
 
 class Change(Enum):
-    """What happens to the files of a scan."""
-
     GREW = "grew"
     BEGIN = "begin"
     END = "end"

@@ -64,8 +64,6 @@ REFUSAL_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class ReceiverConfig:
-    """A ground station's endpoints, store and limits."""
-
     store: Path
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
     limits: DroneLimits = field(default_factory=DroneLimits)
@@ -268,7 +266,6 @@ class Receiver:
         return self.workers.start(f"messages {name}", work)
 
     def _take(self, key: str, payload: bytes) -> None:
-        """Hand on what a drone has sent."""
         place = place_of(key)
         if place is None:
             with self._lock:

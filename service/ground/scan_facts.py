@@ -97,8 +97,6 @@ class _Schema(msgspec.Struct):
 
 
 class Labels(msgspec.Struct, frozen=True):
-    """Title and tags of a scan, kept in ``library.json``."""
-
     title: str = ""
     tags: tuple[str, ...] = ()
     edition: Count = 0  # counts the changes

@@ -101,7 +101,6 @@ class _Pipe(list[bytes]):
         pass
 
     def take(self) -> bytes:
-        """The bytes written since the last call."""
         out = b"".join(self)
         self.clear()
         return out

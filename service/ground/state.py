@@ -258,8 +258,6 @@ class Jobs:
 
 
 class StoreView(Protocol):
-    """Something derived from an open store."""
-
     def refresh(self) -> object: ...
 
 
@@ -349,7 +347,6 @@ def state_of(connection: HTTPConnection) -> PortalState:
 
 
 def names_of(connection: HTTPConnection) -> tuple[str, str]:
-    """Drone and scan in the path, unchecked."""
     return connection.path_params["drone"], connection.path_params["scan"]
 
 

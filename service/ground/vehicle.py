@@ -131,7 +131,6 @@ def _scaled(fields: dict[str, Any], name: str, unit: float) -> float | None:
 
 
 def _home_distance(place: dict[str, Any], home: dict[str, Any]) -> float | None:
-    """Metres over ground from home."""
     from pyproj import Geod
 
     lat, lon = _number(place, "lat"), _number(place, "lon")

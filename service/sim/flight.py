@@ -65,12 +65,10 @@ class FlightPlan:
 
     @property
     def lowest_m(self) -> float:
-        """The height at the lower end of the flight."""
         return min(self.height_m, self.height_m + self.climb_m)
 
     @property
     def highest_m(self) -> float:
-        """The height at the higher end of the flight."""
         return max(self.height_m, self.height_m + self.climb_m)
 
     @property

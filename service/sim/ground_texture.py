@@ -297,7 +297,6 @@ def _roof_facing(block, v, sun):  # type: ignore[no-untyped-def]
 def _colour(  # type: ignore[no-untyped-def]
     begin, end, out, base, cover, which, blocks, light, z, x0, y0, texel_m, step_m, sun, seed
 ):
-    """Fill ``out`` (H, W, 3), texel by texel."""
     photo = base.shape[0] > 1
     for row in range(begin, end):
         for col in range(out.shape[1]):

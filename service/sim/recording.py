@@ -257,7 +257,6 @@ def write(
 
 
 def _write_truth(simulation: Simulation, truth: Path) -> None:
-    """Origin, surface, trajectory and some depth maps."""
     origin = {"lat_deg": ORIGIN.lat_deg, "lon_deg": ORIGIN.lon_deg, "alt_amsl_m": ORIGIN.alt_amsl_m}
     (truth / "origin.json").write_text(json.dumps(origin) + "\n")
     vertices, triangles = simulation.scene.vertices, simulation.scene.triangles

@@ -63,8 +63,6 @@ class Look:
 
 
 class Renderer:
-    """Renders one scene through one camera."""
-
     def __init__(self, scene: Scene, texture: GroundTexture, camera: Camera) -> None:
         """Prepare the rays and tables; raises ValueError for an unusable camera."""
         self.scene, self.texture, self.camera = scene, texture, camera

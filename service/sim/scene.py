@@ -30,8 +30,6 @@ PAINTS = ((40, 40, 160), (150, 90, 40), (210, 210, 210), (60, 60, 60), (40, 120,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Road:
-    """A strip of one surface along a line."""
-
     line: F64  # (N, 2) m
     width_m: float
     surface: int  # ASPHALT or DIRT
@@ -339,7 +337,6 @@ class Area:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """(east, north) extent."""
         return self.x1 - self.x0, self.y1 - self.y0
 
 

@@ -148,7 +148,6 @@ class _SimulatedMessages:
             yield message, GIMBAL_COMPONENT, float(t[k])
 
     def position(self) -> Iterator[Timed]:
-        """GLOBAL_POSITION_INT at 10 Hz."""
         t = self._times(10.0) + 0.001
         at = self.sensors.estimate(t)
         geodetic = self.origin.to_geodetic(at)
@@ -164,7 +163,6 @@ class _SimulatedMessages:
             ), 1, float(t[k])  # fmt: skip
 
     def satellites(self) -> Iterator[Timed]:
-        """GPS_RAW_INT at 5 Hz."""
         t = self._times(5.0) + 0.004
         geodetic = self.origin.to_geodetic(self.sensors.gps(t))
         v, noise = self.sensors.flight.velocity(t), self.sensors.noise
