@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import AsJson, choices, one_of
+from service.commands import AsJson, choices, one_of, showing
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,7 +41,10 @@ def ctl(
     _check(action, metres, timeout)
     from service.ground.operator import Operator, order, status
 
-    with Operator(connect, system, timeout) as operator:
+    with showing("ctl") as progress:
+        progress(f"waiting for the vehicle at {connect}")
+        heard = Operator(connect, system, timeout)
+    with heard as operator:
         if action == "watch":
             _watch(operator, seconds, as_json)
         elif action == "status":

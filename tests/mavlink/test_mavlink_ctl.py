@@ -90,7 +90,9 @@ def test_ctl_says_when_none_or_the_wrong_one_answers() -> None:
     pytest.importorskip("mavsdk")
     port = free_port()
     unheard = run_ctl(port, "start", "--timeout", "1")
-    assert unheard.returncode == 3 and "no skyrelief companion heard" in unheard.stderr
+    first, last = unheard.stderr.splitlines()
+    assert first == f"ctl: waiting for the vehicle at udpin://127.0.0.1:{port}"
+    assert unheard.returncode == 3 and "no skyrelief companion heard" in last
     with Impostor(port):
         wrong = run_ctl(port, "pause")
         assert wrong.returncode == 3
