@@ -1,7 +1,8 @@
 """How a scan looks to cameras that took no part in it: their frames, drawn from its products.
 
 Each frame is rendered at its own pose and compared with what the camera saw: the share of pixels
-that are covered, and PSNR and SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861) of these.
+that are covered, PSNR and SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861) of these, and PSNR
+of those that the depth images cover too: only there do two products show the same places.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -57,6 +58,7 @@ MAX_SLOPE = 0.03
 LEVELS = 4
 """Rounds in which the place on the ground that a pixel looks at is found."""
 
+GRIDS = "surface"
 POINT_PX = 3
 FLOOR_DB = 60.0  # PSNR of images that are the same
 
@@ -75,6 +77,18 @@ class Triangles:
     texture: U8 | None = None  # (h, w, 3) BGR
 
 
+class FrameScore(NamedTuple):
+    """What a product shows of a frame."""
+
+    covered: float  # share of the pixels that look at the map
+    psnr_db: float
+    ssim: float
+    psnr_on_grids_db: float  # of the pixels that the depth images cover too
+
+
+DIGITS = {"covered": 4, "psnr_db": 2, "ssim": 4, "psnr_on_grids_db": 2}
+
+
 def score_views(
     scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {},
     every: int = EVERY,
@@ -88,9 +102,10 @@ def score_views(
     return {
         name: {
             "frames": len(rows),
-            "covered": round(float(np.mean([r[0] for r in rows])), 4),
-            "psnr_db": round(float(np.mean([r[1] for r in rows])), 2),
-            "ssim": round(float(np.mean([r[2] for r in rows])), 4),
+            **{
+                figure: round(float(np.mean(values)), DIGITS[figure])
+                for figure, values in zip(FrameScore._fields, zip(*rows, strict=True), strict=True)
+            },
         }
         for name, rows in frame_scores(scan, video, images, others, every).items()
     }
@@ -99,8 +114,8 @@ def score_views(
 def frame_scores(
     scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {},
     every: int = EVERY, goes_on: Callable[[int], bool] = lambda _: True,
-) -> dict[str, list[tuple[float, float, float]]]:  # fmt: skip
-    """Share covered, PSNR in dB and SSIM of each frame, by product; as ``score_views`` else.
+) -> dict[str, list[FrameScore]]:  # fmt: skip
+    """Figures of each frame, by product; as ``score_views`` else.
 
     ``goes_on`` is asked with the number of frames that are done.
     """
@@ -110,32 +125,41 @@ def frame_scores(
     keyframes, camera = list(main_keyframes(scan.store)), camera_of(scan.store.header)
     products = {**_products(scan, keyframes, camera), **others}
     inside, undistort = looks_inside(scan), Undistorter(camera)
-    scores: dict[str, list[tuple[float, float, float]]] = {name: [] for name in products}
+    scores: dict[str, list[FrameScore]] = {name: [] for name in products}
     for n, (T, seen) in enumerate(_seen(scan, keyframes, undistort, video, every)):
         counts = inside(camera, T) & (undistort.valid > 0)
         if counts.mean() < 0.5:
             continue
         if not goes_on(max(map(len, scores.values()))):
             break
-        row = [seen]
-        for name, draw in products.items():
-            drawn, covered = draw(T)
+        views = {name: draw(T) for name, draw in products.items()}
+        grids = views[GRIDS][1].copy()
+        for name, (drawn, covered) in views.items():
             covered &= counts
             _, likeness = structural_similarity(
                 seen, np.where(covered[..., None], drawn, seen), channel_axis=2, full=True
             )
-            if covered.any():
-                error = float(np.mean((seen[covered].astype(np.float64) - drawn[covered]) ** 2))
-                psnr = min(10.0 * float(np.log10(255.0**2 / max(error, 1e-9))), FLOOR_DB)
-                share = float(covered.sum() / counts.sum())
-                scores[name].append((share, psnr, float(likeness[covered].mean())))
-            row.append(drawn)
+            if (covered & grids).any():
+                scores[name].append(
+                    FrameScore(
+                        float(covered.sum() / counts.sum()),
+                        _psnr_db(seen, drawn, covered),
+                        float(likeness[covered].mean()),
+                        _psnr_db(seen, drawn, covered & grids),
+                    )
+                )
         if images is not None:
             images.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(images / f"view_{n:04d}.png"), np.hstack(row))
+            row = np.hstack([seen, *(drawn for drawn, _ in views.values())])
+            cv2.imwrite(str(images / f"view_{n:04d}.png"), row)
     if not any(scores.values()):
         raise InputError(f"{video}: none of its frames that took no part shows the map")
     return {name: rows for name, rows in scores.items() if rows}
+
+
+def _psnr_db(seen: U8, drawn: U8, where: Bool) -> float:
+    error = float(np.mean((seen[where].astype(np.float64) - drawn[where]) ** 2))
+    return min(10.0 * float(np.log10(255.0**2 / max(error, 1e-9))), FLOOR_DB)
 
 
 def _seen(
@@ -228,7 +252,7 @@ def _products(scan: ScanView, keyframes: Sequence[Keyframe], camera: Camera) -> 
     used = np.unique(grids.faces)
     out: dict[str, Draw] = {
         "points": lambda T: draw_points(camera, T, places[used], colours[used]),
-        "surface": by_rays(grids, camera),
+        GRIDS: by_rays(grids, camera),
     }
     mesh = scan.folder / "mesh.glb"
     if mesh.is_file():

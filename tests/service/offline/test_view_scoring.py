@@ -18,10 +18,13 @@ from typer.testing import CliRunner
 from recon import se3
 from recon.camera_model import rays, scaled
 from recon.surface.raster import Grid, Raster
-from recon.types import Camera
+from recon.types import F64, U8, Bool, Camera
 from service.cli import app
 from service.errors import InputError
-from service.offline.view_scoring import by_rays, depth_grids, looks_inside, placed
+from service.offline.exports.view import ScanView
+from service.offline.view_scoring import by_rays, depth_grids, looks_inside, placed, score_views
+from service.scans.main_piece import main_keyframes
+from service.scans.track import camera_of
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -83,9 +86,26 @@ def test_each_product_is_drawn_at_the_poses_of_the_others(
     for name, figures in found.items():
         assert figures["covered"] > (0.98 if name == "mesh" else 0.9), name
         assert figures["psnr_db"] > 20.0 and 0.5 < figures["ssim"] <= 1.0, name
+    assert found["surface"]["psnr_on_grids_db"] == found["surface"]["psnr_db"]
     (image,) = images.glob("*.png")
     drawn = cv2.imread(str(image))
     assert drawn is not None and drawn.shape == (90, 4 * 160, 3)
+
+
+def test_products_are_compared_on_the_pixels_that_the_depth_images_cover(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with ScanView(flown(tmp_path, house)) as scan:
+        grids = by_rays(depth_grids(list(main_keyframes(scan.store))), camera_of(scan.store.header))
+
+        def over_blue(T: F64) -> tuple[U8, Bool]:
+            drawn, covered = grids(T)
+            drawn[~covered] = (255, 0, 0)
+            return drawn, np.ones_like(covered)
+
+        found = score_views(scan, tmp_path / "stills", others={"over blue": over_blue})
+    assert found["over blue"]["psnr_db"] < found["surface"]["psnr_db"] - 1.0
+    assert found["over blue"]["psnr_on_grids_db"] == found["surface"]["psnr_on_grids_db"]
 
 
 def test_a_depth_image_drawn_at_its_own_pose_is_its_own_image(house: HouseFlight) -> None:
