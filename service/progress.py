@@ -86,18 +86,16 @@ class Progress:
         return say
 
     def branches(self, number: int) -> list[Progress]:
-        """One object for each of several threads, as equal shares of the current part."""
+        """One object for each of several threads, as equal shares of the current part; its text is
+        that of all which have not ended."""
         start, width = self.share, self._end - self.share
         out: list[Progress] = []
-        said: dict[Progress, str] = {}
         lock = threading.Lock()
 
         def show(one: Progress) -> None:
             with lock:
                 self.share = start + width * sum(b.share for b in out) / number
-                is_new = said.get(one) != one.text
-                said[one] = one.text
-                self(one.text if is_new else self.text)
+                self("; ".join(b.text for b in out if b.text and b.share < 1.0) or one.text)
 
         out += [Progress(show) for _ in range(number)]
         return out

@@ -84,13 +84,16 @@ def test_a_cancelled_work_stops_in_every_branch() -> None:
             branch("ends")
 
 
-def test_branches_say_what_is_new_once() -> None:
+def test_branches_say_what_each_does_until_it_has_ended() -> None:
     said: list[str] = []
     progress = Progress(lambda now: said.append(now.text))
     one, other = progress.branches(2)
-    for branch in (one, other, one, other):
+    for branch in (one, other, one):
         branch("left" if branch is one else "right")
-    assert said == ["left", "right", "right", "right"]
+    with one.part("last of the left"):
+        pass
+    other("right")
+    assert said == ["left", *2 * ["left; right"], "last of the left; right", "right"]
 
 
 def test_equal_parts_take_equal_shares() -> None:
