@@ -209,21 +209,23 @@ class LiveMap:
 
 def unmeasured(keyframe: Keyframe, image: bytes) -> PointCloud:
     """The pixels between measured ones, in the colours of the keyframe's ``image`` (JPEG), at the
-    depth of the nearest measured one."""
+    depth of the nearest measured one; none where it cannot be read."""
     from scipy import ndimage
 
+    colours = whole_bgr(keyframe, image)
+    is_readable = colours is not keyframe.bgr
     depth = keyframe.depth
     known = np.isfinite(depth.depth_m) & keyframe.fresh
     size = 2 * GAP_PX + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     padded = np.pad(known, GAP_PX).astype(np.uint8)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[GAP_PX:-GAP_PX, GAP_PX:-GAP_PX]
-    inside = ndimage.binary_fill_holes(closed) & ~known
+    inside = ndimage.binary_fill_holes(closed) & ~known & is_readable
     distance, near = ndimage.distance_transform_edt(~known, return_indices=True)
     filled = replace(
         depth, depth_m=depth.depth_m[tuple(near)], sigma_m=np.zeros_like(depth.sigma_m)
     )
-    cloud = cloud_of(filled, whole_bgr(keyframe, image), inside)
+    cloud = cloud_of(filled, colours, inside)
     return replace(cloud, sigma_m=(UNMEASURED_M + distance[inside]).astype(np.float32))
 
 

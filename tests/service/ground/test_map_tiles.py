@@ -175,6 +175,20 @@ def test_what_nothing_measured_has_the_colour_of_the_image_and_no_height(
         assert at(client, "ortho", NOWHERE)[3] == 0
 
 
+def test_an_image_that_cannot_be_read_shows_nothing_between_what_is_measured(
+    store: Path, house: HouseFlight
+) -> None:
+    one = house.keyframe(5, 300.0)
+    one.depth.depth_m[35:55, 70:90] = np.nan
+    image = encode_image(one.bgr)
+    cut = image[: image.index(b"\xff\xc0") + 19]  # its size, and nothing more
+    with ScanStore.open(store / "drone-1/test-1/scan.db") as scan:
+        scan.add_keyframe(5, encode(one, one.time_ns), cut)
+    with serving(store) as client:
+        assert at(client, "ortho", (300.0, 0.0))[3] == 0
+        assert at(client, "ortho", (300.0, 8.0))[3] == 255
+
+
 def test_shading_and_contours_show_the_walls_alone(client: Client) -> None:
     flat = at(client, "dsm", GROUND)
     assert flat[3] == 255 and abs(int(flat[0]) - round(255 * math.sqrt(0.5))) <= 3
