@@ -142,6 +142,18 @@ class GroundOptions:
 @with_options(GroundOptions)
 def ground(given: GroundOptions) -> None:
     """Receive scans from drones; end with Ctrl-C. Scans: STORE/drones/DRONE/SCAN."""
+    from service.scans.retention import Claim
+
+    config, claim = given.receiver(), Claim()
+    if not claim.take(config.store):
+        raise InputError(f"another ground station works with {config.store}; give another --store")
+    try:
+        _run(given, config)
+    finally:
+        claim.give_up()
+
+
+def _run(given: GroundOptions, config: ReceiverConfig) -> None:
     from service.ground import live_site
     from service.ground.due import MESH
     from service.ground.receiver import Receiver
@@ -150,7 +162,7 @@ def ground(given: GroundOptions) -> None:
     from service.radio import GROUND, RadioLink
     from service.workers import Workers
 
-    config, notifier = given.receiver(), Notifier()
+    notifier = Notifier()
     taken = _take_in(config.store, given.take or [])
     stop, workers = stop_by_signals(), Workers()
     page: Portal | None = None

@@ -16,10 +16,13 @@ from pathlib import Path
 import pytest
 from loopback import free_port, until
 from paths import ROOT
+from typer.testing import CliRunner
 
+from service.cli import app
 from service.commands.ground import feed_watchdog
-from service.errors import SkyreliefError
+from service.errors import InputError, SkyreliefError
 from service.init_system import Notifier
+from service.scans.retention import Claim
 from service.workers import Worker, Workers, row_of
 
 pytest.importorskip("zenoh")
@@ -59,6 +62,18 @@ def test_ground_feeds_the_watchdog_and_asks_for_time_to_close(tmp_path: Path) ->
                 heard.append(listener.recv(200).decode())
     assert heard[0] == "READY=1"
     assert "STOPPING=1" in heard and heard[-1].startswith("EXTEND_TIMEOUT_USEC=")
+
+
+def test_a_second_station_on_a_store_is_refused(tmp_path: Path) -> None:
+    other = Claim()
+    assert other.take(tmp_path)
+    try:
+        done = CliRunner().invoke(app, ["ground", "--store", str(tmp_path)])
+    finally:
+        other.give_up()
+    assert isinstance(done.exception, InputError) and "another ground station" in str(
+        done.exception
+    )
 
 
 def test_a_worker_that_hangs_starves_the_watchdog_and_one_that_failed_ends_the_process(
