@@ -422,10 +422,11 @@ def _logout(request: Request) -> Response:
 
 
 def _status(request: Request) -> Response:
-    """Scans that are being received."""
+    """Scans that are being received, and whether who asks has a session or the token."""
     state = state_of(request)
     return JSONResponse(
         {
+            "session": request.scope[WHO] is not None,
             "up_s": round(time.monotonic() - state.started, 1),
             "live_views": sum(state.live_views.values()),
             "receiving": state.progress(),

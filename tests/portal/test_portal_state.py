@@ -58,9 +58,12 @@ def test_logging_out_ends_the_session(browser: Browser, scans: Path) -> None:
     may_change = "fetch('/api/upload').then(answer => String(answer.status))"
     with page_of(browser, scans, []):
         browser.wait(f"await {may_change} !== '401'")
+        shown = "[...document.querySelectorAll('header button')].filter(b => b.checkVisibility())"
+        browser.wait(f"{shown}.some(b => b.textContent === 'Log out')")
         browser.click("Log out")
         browser.wait(f"await {may_change} === '401'")
         browser.wait("document.querySelectorAll('article').length === 1")  # this machine may read
+        assert "Log out" not in browser.run(f"{shown}.map(b => b.textContent)")
 
 
 def test_the_state_says_when_the_drone_was_heard(browser: Browser, scans: Path) -> None:

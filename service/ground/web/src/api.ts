@@ -255,6 +255,8 @@ export const controlImage = (s: { drone: string; scan: string }, seq: number): s
 export const controlAddress = (s: { drone: string; scan: string }): string =>
   `#/control/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
 
+/** Whether this browser may change anything, with a session that can be ended. */
+export const hasSession = (): Promise<boolean> => ask<{ session: boolean }>("/api/status").then(({ session }) => session);
 export const jobs = (): Promise<Job[]> => ask("/api/jobs");
 export const cancel = (number: number): Promise<Job> => ask(`/api/jobs/${number}`, "DELETE");
 export const bin = (): Promise<string[]> => ask("/api/bin");

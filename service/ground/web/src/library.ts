@@ -41,8 +41,10 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   const leave = el("button", {
     textContent: "Log out",
     title: "End this browser's session",
+    hidden: true, // until it is known to have one
     onclick: () => void api.ask("/api/logout", "POST").then(() => location.reload(), notify),
   });
+  void api.hasSession().then((has) => (leave.hidden = !has), () => undefined);
   root.replaceChildren(
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload), leave),
     cut,
