@@ -87,3 +87,14 @@ def test_a_skirt_has_the_colours_of_its_own_place(tmp_path_factory: pytest.TempP
         away = np.abs(at - EDGE_PX - 0.5 - np.clip(pixel, 0, size - 1)).max(axis=1)
         assert (pixel.min() < 0) and (away.max() < 0.1) == is_whole
         assert away.max() < 3.0  # else those of the nearest measured pixel
+
+
+@pytest.mark.slow
+def test_a_graphics_card_keeps_images_sharp_where_they_lie_aslant(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    seen = """given.map((card) => { const texture = new three.Texture(); page.sharpen(texture, card);
+      return [texture.anisotropy, texture.minFilter === three.LinearMipmapLinearFilter]; })"""
+    run = web_module(tmp_path_factory.mktemp("sharp"), "surface", seen)
+    cards = [{"software": software, "anisotropy": 16} for software in (True, False)]
+    assert run(cards) == [[1, False], [16, True]]

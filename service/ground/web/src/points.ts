@@ -7,7 +7,7 @@ import { type Chunk, EDGE_PX, FIRST, isVoid, sigmaAt, viewsAt } from "./depth";
 import { Ground, type Samples } from "./fill";
 import type { Gradual } from "./painter";
 import { type Colour, COLOURS, SHADE } from "./shade";
-import { BEHIND, LEVELS, Surface } from "./surface";
+import { BEHIND, type Card, LEVELS, Surface } from "./surface";
 import { length } from "./units";
 
 /** Between the keyframes' numbers of two scans that are drawn together. */
@@ -84,6 +84,7 @@ interface Held {
 
 export class Cloud implements Gradual {
   readonly group = new THREE.Group();
+  card: Card = { software: true, anisotropy: 1 };
   budget = 3_000_000;
   drawn = 0;
   /** What is added to heights that are shown: the origin's altitude above the sea. */
@@ -179,7 +180,7 @@ export class Cloud implements Gradual {
     });
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
-    const surface = new Surface(chunk, { ...this.shared, ...own }, this.defines);
+    const surface = new Surface(chunk, { ...this.shared, ...own }, this.defines, this.card);
     const held: Held = { object, surface, shown: true, unit_m, points: sigma.length, layer: chunk.layer, values: rgb.slice(0, 600), time: chunk.time_unix_s, T: chunk.T, scale: chunk.scale };
     this.chunks.set(chunk.seq, held);
     this.place(chunk.seq, held);

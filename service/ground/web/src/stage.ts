@@ -5,6 +5,7 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { VRButton } from "three/addons/webxr/VRButton.js";
 import { type Gradual, Painter } from "./painter";
+import { type Card, sharpen } from "./surface";
 
 /** Sky above, ground below the horizon. */
 const DARK = ["#243648", "#465a6b", "#2b3036", "#171b20"];
@@ -13,6 +14,7 @@ const INPUTS = ["click", "input", "change"];
 // Until then a part of many points is drawn: after a movement, after other news.
 const MOVED_MS = 250;
 const NEWS_MS = 500;
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // names of cards that are none
 const LOWEST = Math.PI / 2; // the eye is not turned below what it looks at: the ground has no other side
 const MARGIN = 0.92; // of the scene that is filled
 const OUTLINE_POINTS = 1000;
@@ -96,6 +98,13 @@ export class Stage {
     (this.scene.background as THREE.Texture | null)?.dispose();
     this.scene.background = texture;
     this.touch();
+  }
+
+  /** What draws here. */
+  get card(): Card {
+    const gl = this.renderer.getContext();
+    const name = String(gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER));
+    return { software: SOFTWARE.test(name), anisotropy: this.renderer.capabilities.getMaxAnisotropy() };
   }
 
   add(object: THREE.Object3D): void {
@@ -223,6 +232,10 @@ export class Stage {
   async load(address: string): Promise<() => void> {
     const { scene } = await new GLTFLoader().loadAsync(address);
     scene.rotation.x = Math.PI / 2;
+    scene.traverse((node) => {
+      const map = node instanceof THREE.Mesh && (node.material as THREE.MeshStandardMaterial).map;
+      if (map) sharpen(map, this.card);
+    });
     this.model.add(scene);
     this.touch();
     return () => void this.model.remove(scene);

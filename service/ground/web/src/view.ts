@@ -68,6 +68,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     return () => undefined;
   }
   const stage = new Stage(host);
+  cloud.card = stage.card;
   const cameras = new Cameras();
   const canvas = stage.renderer.domElement;
   const target = (): Object3D => (stage.model.children.length ? stage.model : cloud.group);
