@@ -191,6 +191,26 @@ def test_a_finished_scan_opens_as_its_mesh(browser: Browser, portal: Portal, sca
     browser.wait(f"{PRESSED} === 'Surface'")
 
 
+def test_a_phone_stays_at_the_surface_where_the_mesh_is_large(
+    browser: Browser, portal: Portal, scans: Path
+) -> None:
+    folder = scans / "drone-1/test-1"
+    with ScanStore.open(folder / "scan.db") as store:
+        store.finish({})
+        write_deliverables(folder, store)
+    with (folder / "mesh.glb").open("wb") as mesh:
+        mesh.truncate(20_000_000)
+    offered = "[...document.querySelectorAll('button')].some(b => b.textContent === 'Mesh')"
+    for width, height, is_loaded in ((390, 844, False), (1280, 800, True)):
+        browser.screen(width, height)
+        browser.open("about:blank")
+        browser.wait("location.href === 'about:blank'")
+        browser.requests.clear()
+        browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+        browser.wait(f"{offered} && document.body.dataset.still === 'yes'")
+        assert any(url.endswith("/mesh.glb") for url in browser.requests) == is_loaded
+
+
 def drawn(browser: Browser) -> I64:
     """(h, w, 3) the view, BGR."""
     script = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"

@@ -93,7 +93,9 @@ def test_a_skirt_has_the_colours_of_its_own_place(tmp_path_factory: pytest.TempP
 def test_a_graphics_card_keeps_images_sharp_where_they_lie_aslant(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    seen = """given.map((card) => { const texture = new three.Texture(); page.sharpen(texture, card);
+    seen = """given.map((card) => {
+      const texture = new three.Texture();
+      page.sharpen(texture, card);
       return [texture.anisotropy, texture.minFilter === three.LinearMipmapLinearFilter]; })"""
     run = web_module(tmp_path_factory.mktemp("sharp"), "surface", seen)
     cards = [{"software": software, "anisotropy": 16} for software in (True, False)]

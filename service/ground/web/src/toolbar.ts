@@ -293,10 +293,15 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): { elements: HTMLEle
   return { elements: [group(...buttons), group(measured)], refresh };
 }
 
-/** Whether a mesh is small enough to be loaded unasked: a phone has little memory. */
+/**
+ * Whether a mesh is small enough to be loaded unasked: a phone has little memory, and a link may be dear. The surface
+ * has levels of detail, and takes a tenth of the bytes.
+ */
 function fits({ files }: api.Scan): boolean {
   const bytes = files.find((f) => f.name === "mesh.glb")?.bytes ?? Infinity;
-  return bytes < (matchMedia("(pointer: coarse)").matches ? MAX_PHONE_BYTES : MAX_UNASKED_BYTES);
+  const { connection } = navigator as { connection?: { saveData: boolean } };
+  const isPhone = connection?.saveData || matchMedia("(pointer: coarse), (max-width: 600px)").matches;
+  return bytes < (isPhone ? MAX_PHONE_BYTES : MAX_UNASKED_BYTES);
 }
 
 /** Makes a product unless it is there. */
