@@ -9,6 +9,7 @@ const CELLS = 256; // along the longer side
 const MIN_CELL_M = 0.05;
 const CLOSED = 24; // a gap of up to twice as many cells between known ones is filled
 const RIM = 5; // cells that fade around
+const MARGIN = CLOSED + 2; // cells around all samples: gaps are closed as far from them as anywhere
 const STEP_M = 0.5; // a neighbour that stands higher is another surface
 const SMOOTHINGS = 60;
 const SPIKE = 4; // cells around one that is compared with them
@@ -75,8 +76,8 @@ export function filled(samples: Samples): Field | null {
   if (box.isEmpty()) return null;
   const extent = box.getSize(new THREE.Vector2());
   const cell = Math.max(MIN_CELL_M, Math.max(extent.x, extent.y) / CELLS);
-  const [west, south] = [box.min.x - RIM * cell, box.min.y - RIM * cell];
-  const [cols, rows] = [extent.x, extent.y].map((m) => Math.ceil(m / cell) + 2 * RIM + 1) as [number, number];
+  const [west, south] = [box.min.x - MARGIN * cell, box.min.y - MARGIN * cell];
+  const [cols, rows] = [extent.x, extent.y].map((m) => Math.ceil(m / cell) + 2 * MARGIN + 1) as [number, number];
   const n = cols * rows;
   const [low, sum, count, rgb] = [new Float32Array(n).fill(Infinity), new Float32Array(n), new Float32Array(n), new Float32Array(3 * n)];
   samples((x, y, z, r, g, b) => {
