@@ -98,7 +98,8 @@ def test_a_slow_station_is_not_asked_again_before_it_has_answered(page: Browser)
 
 def test_the_page_that_is_left_takes_no_clicks(page: Browser) -> None:
     left = "document.querySelector('#app > *').inert"
-    page.run(f"addEventListener('hashchange', () => {{ window.left = {left} }})")
+    fades = "getComputedStyle(document.querySelector('#app > *')).transitionDuration === '0.3s'"
+    page.run(f"addEventListener('hashchange', () => {{ window.left = {left} && {fades} }})")
     page.run("location.hash = '#/view/drone-1/test-1'")
     page.wait("document.body.dataset.points > 0")
     assert page.run("window.left") is True
