@@ -116,10 +116,18 @@ def test_the_time_slider_shows_the_cloud_as_it_was(page: Browser) -> None:
     assert page.run("document.querySelector('.time output').textContent") == "1 s"
     page.wait("document.body.dataset.image === '1'")  # the image and the figures go along
     images = "document.querySelector('.figures').innerText.match(/Images\\n(\\d+)/)?.[1]"
-    page.wait(f"{images} === '2'")
+    flown = "document.querySelector('.figures').innerText.includes('Flown')"
+    caption = "document.querySelector('.latest figcaption').textContent"
+    page.wait(f"{images} === '2' && !{flown} && {caption} === 'keyframe 1'")
     page.run(SET.format(".time input", "5"))
     assert drawn(page) == whole
-    page.wait(f"document.body.dataset.image === '4' && {images} === '5'")
+    page.wait(f"document.body.dataset.image === '4' && {images} === '5' && {flown}")
+    page.wait(f"{caption} === 'latest keyframe, 4'")
+    page.run(
+        "Object.defineProperty(document, 'hidden', { value: true })"
+    )  # asks for nothing by itself
+    page.run(SET.format(".time input", "3"))
+    page.wait(f"{caption} === 'keyframe 2'")
 
 
 def test_the_slider_of_several_dates_states_dates_in_their_order(

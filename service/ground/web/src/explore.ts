@@ -22,8 +22,9 @@ export interface Site {
   id: { drone: string; scan: string };
 }
 
-/** A slider over the keyframes: all as it was when each was taken, played if one likes; at its end it follows. */
-export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElement; refresh: () => void; toEnd: () => void } {
+/** A slider over the keyframes: all as it was when each was taken, played if one likes; at its end it follows. `moved` is
+ * called with each of its moves. */
+export function timeSlider({ stage, cloud, cameras }: Site, moved: () => void): { element: HTMLElement; refresh: () => void; toEnd: () => void } {
   const input = el("input", { type: "range", min: "1", value: "1", max: "1" });
   input.setAttribute("aria-label", "time of the flight");
   const shown = el("output", {});
@@ -41,6 +42,7 @@ export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElem
     shown.value = moment(moments[k]!, moments[0]!, moments.at(-1)!);
     day.textContent = new Date(1000 * moments[k]!).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
     cameras.stand(last ? null : cloud.own.newest);
+    moved();
     stage.touch();
   };
   const stop = (): void => {
@@ -175,6 +177,7 @@ export class Images {
   readonly element = el("figure", { className: "panel latest", hidden: true });
   /** Ends it. */
   readonly close = api.every(IMAGE_EVERY_MS, async () => this.refresh());
+  private loading = false; // one at a time: a flight may play faster than they come
   private chosen: number | null = null;
   private shown = -1;
   private version = 0;
@@ -199,22 +202,29 @@ export class Images {
     this.refresh();
   }
 
-  private refresh(): void {
+  /** Shows the image of what is chosen, or of the newest keyframe by now. */
+  refresh(): void {
     const seq = this.chosen ?? this.site.cloud.own.newest;
-    if (seq < 0 || seq === this.shown) return;
+    if (seq < 0 || seq === this.shown || this.loading) return;
     this.shown = seq;
+    this.loading = true;
     const image = new Image();
     image.alt = `keyframe ${seq}, seen from the aircraft`;
-    image.onload = () => this.show(seq, image);
+    image.onload = () => {
+      this.loading = false;
+      this.show(seq, image);
+      this.refresh();
+    };
+    image.onerror = () => (this.loading = false);
     image.src = `${api.keyframe(this.site.id, seq)}?v=${this.version}`;
   }
 
   private show(seq: number, image: HTMLImageElement): void {
     if (seq !== this.shown) return; // another one was chosen meanwhile
-    const { cameras, stage } = this.site;
+    const { cameras, cloud, stage } = this.site;
     cameras.show(seq, image);
     stage.touch();
-    const text = this.chosen === null ? `latest keyframe, ${seq}` : `keyframe ${seq}`;
+    const text = this.chosen === null && cloud.isWhole ? `latest keyframe, ${seq}` : `keyframe ${seq}`;
     const back = el("button", { textContent: "Latest", title: "back to the newest keyframe" });
     back.onclick = () => ((this.chosen = null), this.refresh());
     this.element.hidden = false;

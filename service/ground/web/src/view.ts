@@ -90,7 +90,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const site = { stage, cloud, cameras, id };
   const others = new SiteView(stage, cloud, cameras);
   const images = new Images(site, () => !ruler.active && !notes.active);
-  const time = timeSlider(site);
+  const time = timeSlider(site, () => images.refresh());
   side.append(images.element);
   host.append(time.element);
   stage.before.push(ruler.draw, notes.draw, () => {
@@ -221,7 +221,7 @@ function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, la
   const [across, up] = finished ? [quality?.position_sigma_h_median_m, api.heightSigma(quality)] : (last?.sigma_h_v_m ?? []);
   if (across && up) facts.push(["Absolute", units.sigmas(across, up)]);
   if (finished && quality?.scale_sigma) facts.push(["Scale", `±${units.share(quality.scale_sigma)}`]);
-  if (last) facts.push(["Flown", units.length(last.distance_m, 0)]);
+  if (last && cloud.isWhole) facts.push(["Flown", units.length(last.distance_m, 0)]);
   if (last && !finished) {
     facts.push(["Speed", units.speed(last.speed_m_s)]);
     if (last.agl_m !== null) facts.push(["Height", units.length(last.agl_m, 1)]);
