@@ -1,4 +1,4 @@
-"""The filled ground below the surfaces."""
+"""Parts of the view by themselves: the filled ground below the surfaces, the words of shares."""
 
 from __future__ import annotations
 
@@ -36,3 +36,8 @@ def test_the_ground_ends_where_the_map_does_also_at_its_outermost_corners(tmp_pa
     assert beyond.max() < 8 * field["cell"]  # which fades
     whole = alpha[row, col] == 1.0
     assert beyond[whole].max() < 3 * field["cell"] and whole.sum() * field["cell"] ** 2 > 5900.0
+
+
+def test_a_share_that_is_tiny_is_not_said_to_be_none(tmp_path: Path) -> None:
+    said = web_module(tmp_path, "units", "given.map((value) => page.share(value))")
+    assert said([0.25, 0.034, 0.0012, 0.0004]) == ["25 %", "3.4 %", "0.1 %", "0.04 %"]

@@ -53,5 +53,6 @@ export const volume = (m3: number): string => {
 export const speed = (m_s: number): string =>
   imperial() ? `${((m_s * 3600) / 1609.344).toFixed(1)} mph` : `${m_s.toFixed(1)} m/s`;
 
-/** A small share of something. */
-export const share = (value: number): string => `${(100 * value).toFixed(value < 0.1 ? 1 : 0)} %`;
+/** A small share of something; never none of it. */
+export const share = (value: number): string =>
+  `${value < 0.001 ? Number((100 * value).toPrecision(1)) : (100 * value).toFixed(value < 0.1 ? 1 : 0)} %`;
