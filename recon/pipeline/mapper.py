@@ -24,7 +24,6 @@ from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import KeyframeMap, SurfaceMap
 from recon.pipeline.stages import (
     DenseStereo,
-    PlausibleDepth,
     Timing,
     Undistort,
     check_image,
@@ -42,15 +41,13 @@ from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.adjusted_track import AdjustedTrack
-from recon.tracking.frame import NO_IMAGE, Frame, Tracking
+from recon.tracking.frame import CONTRADICTED, NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
 from recon.types import U8, Array, Camera, DepthMap, Keyframe, PointCloud, Pose, PosePrior
 
 
 @dataclass(frozen=True, slots=True)
 class MapperConfig:
-    """Parameters of a :class:`Mapper`."""
-
     # A view each so many metres along the track, or frames; by base to height where both are 0.
     spacing_m: float = 0.0
     spacing_frames: int = 0
@@ -200,7 +197,6 @@ class Mapper:
             DepthFusionConfig(),
         )
         self.stereo = DenseStereo(backend, stereo, dense, self.rejected, self.debug, timing)
-        self.plausible = PlausibleDepth(self.rejected)
         self._first_stereo: DenseStereo | None = None
         if config.first_depths:
             first = replace(stereo, min_base_to_height=FIRST_BASE_TO_HEIGHT, guided=False,
@@ -298,16 +294,20 @@ class Mapper:
         if self.debug is not None:
             self.debug.clear()
         depth, bgr = self.stereo(view)  # virtual stereo pairs, section 2.1; Eq. 1 to 3
-        if depth is not None:
-            depth = self.plausible(view, depth, bgr)  # nothing that cannot be
-        self.stereo.learn(depth)  # how far the relief of the next pairs may reach
-        return partial(self._place, view, depth, bgr, self.plausible.agreement[view.segment])
+        seen = None if depth is None else without_false_surface(view, depth, bgr)
+        self.stereo.learn(seen)  # how far the relief of the next pairs may reach
+        return partial(self._place, view, seen, bgr, is_matched=depth is not None)
 
     def _place(
-        self, view: StereoView, depth: DepthMap | None, bgr: U8, agreement: int
+        self, view: StereoView, depth: DepthMap | None, bgr: U8, is_matched: bool
     ) -> Reconstructed:
         """The pose of a view, and its new surface."""
-        self.keyframes.graph.segments[view.segment].agreement = agreement
+        segment = self.keyframes.graph.segments[view.segment]
+        if is_matched and not segment.judge(depth is not None):
+            self.rejected[
+                CONTRADICTED if depth is None else f"{CONTRADICTED} in earlier views"
+            ] += 1
+            depth = None
         pose = self.keyframes.add(view, depth)  # ICP onto the keyframe before, pose graph
         if depth is None:
             return pose, ()
@@ -437,7 +437,6 @@ class Mapper:
         return self.stereo.pairs
 
     def refusals(self) -> Counter[str]:
-        """Frames, views and pairs not used, by reason."""
         return self.refused + self.rejected + self._waiting
 
 

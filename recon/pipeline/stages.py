@@ -20,7 +20,7 @@ from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import PairDepth, carry, fuse, label_noise, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
-from recon.tracking.frame import CONTRADICTED, NO_IMAGE, Frame
+from recon.tracking.frame import NO_IMAGE, Frame
 from recon.tracking.matching import build_pyramid
 from recon.types import (
     F32,
@@ -224,7 +224,6 @@ class DenseStereo:
     def _reprojected(
         self, disparity: DisparityMap, pair: RectifiedPair, K: F64, size_px: tuple[int, int]
     ) -> PairDepth:
-        """The pair's depth on the view's grid."""
         with self._timing("reproject"):
             if isinstance(pair, PolarPair):
                 return reproject_polar(disparity, pair, K, size_px)
@@ -239,23 +238,6 @@ def without_false_surface(view: StereoView, depth: DepthMap, bgr: U8) -> DepthMa
     """A view's ``depth``, which has the colours ``bgr``, where its camera can have seen that; None
     with nothing left."""
     return plausible(drop_edges(depth, bgr), view.frame.prior)
-
-
-class PlausibleDepth:
-    """Depth :func:`without_false_surface`, of the segments whose views agree."""
-
-    def __init__(self, rejected: Counter[str]) -> None:
-        self.agreement = Counter[int]()  # by segment, see Segment
-        self._rejected = rejected
-
-    def __call__(self, view: StereoView, depth: DepthMap, bgr: U8) -> DepthMap | None:
-        """The depth; None with nothing left, or where the motion of the view's segment is false."""
-        kept = without_false_surface(view, depth, bgr)
-        self.agreement[view.segment] += -1 if kept is None else 1
-        if kept is not None and self.agreement[view.segment] > 0:
-            return kept
-        self._rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
-        return None
 
 
 def keyframe_of(

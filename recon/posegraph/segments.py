@@ -63,6 +63,11 @@ class Segment:
         """True where as many of its views contradict themselves as not: all share one motion."""
         return self.agreement <= 0
 
+    def judge(self, is_plausible: bool) -> bool:
+        """Count a view by its depth; True where that can be used."""
+        self.agreement += 1 if is_plausible else -1
+        return is_plausible and not self.is_false
+
     @property
     def frame(self) -> Alignment:
         """The similarity; until there is one, its own frame turned to the first attitude."""

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from some_views import view_at
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
-from recon.pipeline.stages import PlausibleDepth
-from recon.pipeline.views import StereoView
 from recon.posegraph.segments import Segments
 from recon.stereo.reprojection import plausible
 from recon.types import F64, U8, DepthMap, PosePrior
@@ -97,21 +93,13 @@ def test_nothing_left_is_no_depth() -> None:
 
 def test_a_segment_that_was_refuted_needs_more_views_that_agree() -> None:
     """Two views of a false motion contradict themselves; a third that does not stays out."""
-    rejected, segments = Counter[str](), Segments()
-    plausible = PlausibleDepth(rejected)
-
-    def stage(view: StereoView, depth: DepthMap) -> DepthMap | None:
-        kept = plausible(view, depth, np.zeros((*SHAPE, 3), np.uint8))
-        segments[view.segment].agreement = plausible.agreement[view.segment]
-        return kept
-
+    segments = Segments()
+    first, second = segments[0], segments[1]
     false, good = surface(np.zeros(SHAPE, np.uint8)), surface(np.full(SHAPE, 2, np.uint8))
-    first, second = (view_at(n, np.eye(4), segment=n) for n in range(2))
-    assert [stage(first, d) for d in (false, false, good, good)] == [None] * 4
-    assert stage(first, good) is good
-    assert stage(second, good) is good
-    assert sum(rejected.values()) == 4
-    assert not segments[0].is_false and not segments[1].is_false
-    segments[1].add_surface(7, 100, second.frame.prior)
-    assert stage(second, false) is None and segments[1].is_false
+    found = [plausible(d, PosePrior()) is not None for d in (false, false, good, good, good)]
+    assert found == [False, False, True, True, True]
+    assert [first.judge(one) for one in found] == [False] * 4 + [True]
+    assert second.judge(True) and not second.is_false
+    second.add_surface(7, 100, PosePrior())
+    assert not second.judge(False) and second.is_false
     assert [s.surface for s in segments.false()] == [[7]]  # it was kept before that showed
