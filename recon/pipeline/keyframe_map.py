@@ -124,7 +124,6 @@ class KeyframeMap:
         return T_chain, carried(self.trajectory.pose(self._newest), step)
 
     def add_surface(self, view: StereoView, keyframe: Keyframe) -> None:
-        """Count the surface of a view that became a keyframe."""
         points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
         self.graph.segments[view.segment].add_surface(view.seq, points, view.frame.prior)
 
@@ -191,7 +190,6 @@ class SurfaceMap:
         return replace(depth, sigma_m=sigma_m, T_world_camera=T_odom_camera)
 
     def _empty(self, depth: DepthMap) -> VoxelMap:
-        """A map as fine as the first view."""
         ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
         return self._new_map(max(2.0 * ground_m, self._resolution_m, 1e-3))
 

@@ -73,7 +73,6 @@ class StereoView:
 
     @property
     def bgr(self) -> U8:
-        """(H, W, 3) of the view."""
         assert self.image.bgr is not None
         return self.image.bgr
 

@@ -131,7 +131,6 @@ class Alignment(Similarity):
 
     @property
     def sigma_scale(self) -> float:
-        """Relative 1-sigma uncertainty of the scale."""
         return float(np.sqrt(self.covariance[6, 6]))
 
     @property

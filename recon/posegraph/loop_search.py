@@ -49,7 +49,6 @@ class _Kept:
     size_px: tuple[int, int]
 
     def gray(self) -> U8:
-        """(H, W) image."""
         return np.asarray(cv2.imdecode(self.image, cv2.IMREAD_GRAYSCALE), np.uint8)
 
     @cached_property
@@ -171,7 +170,6 @@ class LoopSearch:
         return [seq for _, seq in sorted(found, reverse=True)]
 
     def _is_apart(self, one: _Kept, two: _Kept) -> bool:
-        """True when two keyframes are not neighbours on one chain."""
         gap = two.ordinal - one.ordinal
         return gap >= self._min_gap or one.segment != two.segment
 

@@ -197,7 +197,6 @@ class PoseGraph:
         return Pose(T, covariance, self.sources(seq), self.scale(seq))
 
     def scale(self, seq: int) -> float:
-        """Metres per unit of the odometry at keyframe ``seq``."""
         node = self._nodes[seq]
         log = self._smoother.logs()[self._factors.scale_of[node.key]]
         return self.segments[node.segment].frame.scale * float(np.exp(log))
@@ -212,7 +211,6 @@ class PoseGraph:
         return self._smoother.poses()
 
     def sources(self, seq: int) -> tuple[str, ...]:
-        """Names of the sources that keyframe ``seq`` rests on."""
         used = self._factors.sources[self._nodes[seq].key]
         return tuple(name for name in SOURCES if name in used)
 

@@ -107,7 +107,6 @@ class FixAverage:
         self._fixes = 0  # in the mean
 
     def take(self, T_odom_camera: F64, prior: PosePrior) -> None:
-        """Add a frame of the track with its telemetry."""
         if prior.gnss_minus_baro_ns <= self._last_ns:  # that of the frame before, again
             prior = replace(prior, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
         self._last_ns = max(self._last_ns, prior.gnss_minus_baro_ns)

@@ -12,8 +12,6 @@ from recon.types import F64, PosePrior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
-    """One keyframe and what is known of it."""
-
     seq: int
     key: int  # in the graph
     time_ns: int
@@ -61,7 +59,6 @@ class Loop:
         return self.a, self.b
 
     def scaled(self, factor: float) -> Loop:
-        """The same with lengths multiplied by ``factor``."""
         T = self.T_a_b.copy()
         T[:3, 3] *= factor
         return replace(self, T_a_b=T, covariance=se3.in_units(self.covariance, factor))

@@ -109,7 +109,6 @@ def columns_of(keys: I64, first: int, end: int) -> I64:
 
 
 def scale_columns(at: State, keys: I64) -> I64:
-    """(n, 1) columns of scales."""
     return np.asarray(6 * len(at.R) + keys[:, None])
 
 

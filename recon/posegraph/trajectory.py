@@ -113,7 +113,6 @@ class Trajectory:
         return replace(pose, covariance=covariance, is_aligned=frame is not None)
 
     def places(self, seqs: Sequence[int]) -> F64:
-        """(N, 4, 4) T_world_camera of keyframes."""
         return self._placed(np.searchsorted(self._table.rows["seq"], seqs))[0]
 
     def similarities(self, seqs: Sequence[int]) -> F64:
@@ -198,7 +197,6 @@ class Trajectory:
     # ---- publishing ----------------------------------------------------------------------------
 
     def publish(self, seq: int, pose: Pose) -> None:
-        """Remember that this pose of the keyframe was published."""
         row = self._table.rows[self._row[seq]]
         row["is_published"], row["sigma_m"], row["scale"] = True, sigma_m(pose), pose.scale
         row["T_world_camera"], row["covariance"] = pose.T_world_camera, pose.covariance

@@ -66,7 +66,6 @@ class Landmarks:
         self._xyz = origin + (self._xyz - origin) * factor
 
     def forget_before(self, number: int) -> None:
-        """Free all points with smaller numbers."""
         gone = min(max(number - self._first, 0), len(self._xyz))
         self._xyz = self._xyz[gone:].copy()
         self._first += gone

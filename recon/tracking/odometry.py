@@ -19,12 +19,8 @@ from recon import se3
 from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.focal_watch import FocalWatch
-from recon.tracking.frame import NO_IMAGE, Frame, Landmarks, Tracking
-from recon.tracking.keyframe_window import (
-    adjust_window,
-    median_depth,
-    triangulate,
-)
+from recon.tracking.frame import NO_IMAGE, UNKNOWN, Frame, Landmarks, Tracking
+from recon.tracking.keyframe_window import adjust_window, median_depth, triangulate
 from recon.tracking.localisation import (
     LOOSE_PX,
     LOW_RATE_GAP_S,
@@ -96,7 +92,7 @@ class Odometry:
         self._lost = 0
         self._missed_frame: Frame | None = None  # the last still, where it is lost
         self._late: Frame | None = None  # it, once the next still has placed it
-        self._model: ConstantVelocity | None = None
+        self._model = ConstantVelocity(0, np.eye(4), UNKNOWN)  # of the newest segment
         self.exposure = ExposureWatch()
         self._row_track = RowTrack(lens or camera, seeks_readout)
         clock = self._row_track.clock
@@ -115,7 +111,7 @@ class Odometry:
         ``frames_per_step`` is how many frames at least are followed from keyframe to keyframe."""
         if not self._is_metric or self._lost:
             return False
-        moved, turned, gap_s = self._motion_model.shift(time_ns, prior, self._depth)
+        moved, turned, gap_s = self._model.shift(time_ns, prior, self._depth)
         max_gap_s = SOUGHT_GAP_S if self._row_track.is_rolling else MAX_GAP_S
         max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
         step = max(moved / self._base_to_height, turned / MAX_TURN_RAD)
@@ -144,7 +140,7 @@ class Odometry:
         if not self._is_metric:
             return self._second_view(new)
         found = self._localiser.locate(
-            new, self.keyframes, self._motion_model, self._low_frame_rate, lost=self._lost > 0
+            new, self.keyframes, self._model, self._low_frame_rate, lost=self._lost > 0
         )
         if not isinstance(found, str):
             return self._accept(new, found)
@@ -153,7 +149,7 @@ class Odometry:
 
     def _expected(self, time_ns: int, prior: PosePrior) -> F64:
         """(4, 4) T_camera_odom of a new frame, as far as it can be foreseen."""
-        if self._model is not None:
+        if self.segment >= 0:
             return se3.inverse(self._model.ahead(time_ns, prior)[0])
         R = prior.R_world_camera
         return np.eye(4) if R is None else se3.compose(R.T, np.zeros(3))
@@ -168,12 +164,6 @@ class Odometry:
         """Too long since the frame before for a motion model to hold."""
         return self._gap_ns > 1e9 * LOW_RATE_GAP_S
 
-    @property
-    def _motion_model(self) -> ConstantVelocity:
-        """The motion since the segment's first frame."""
-        assert self._model is not None
-        return self._model
-
     def _found(self, new: Frame, state: Tracking, T_odom_camera: F64, tracks: int = 0) -> Frame:
         """The frame with its pose (4, 4), from now on relative to the newest keyframe."""
         key = self.keyframes[-1]
@@ -183,7 +173,6 @@ class Odometry:
         )  # fmt: skip
 
     def _unplaced(self, new: Frame, state: Tracking, reason: str, tracks: int = 0) -> Frame:
-        """The frame without a pose."""
         return replace(new, state=state, segment=self.segment, tracks=tracks, reason=reason)
 
     def _missed(self, new: Frame, reason: str) -> Frame:
@@ -233,7 +222,6 @@ class Odometry:
         )  # fmt: skip
 
     def _corners(self, new: Frame) -> F64:
-        """(N, 2) Harris corners of the frame, Eq. 4-5."""
         found = matching.harris_grid(new.small, mask=new.mask)
         return found[:, :2].astype(np.float64)
 
@@ -310,7 +298,7 @@ class Odometry:
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
         T_odom_camera = se3.inverse(T_camera_odom)
         px_s = self._px_s(T_odom_camera, depth)
-        self._motion_model.update(new.time_ns, T_odom_camera, new.prior)
+        self._model.update(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
         due = self._base_to_height * (OVERDUE if new.is_blurred else 1.0)
         if base < due and found.share > MIN_OVERLAP and turned < MAX_TURN_RAD:
@@ -326,7 +314,7 @@ class Odometry:
             seen += self._localiser.others(new, self.keyframes, found)
         corners = [(other.key, other.uv, other.ok) for other in seen]
         placed = self._add_keyframe(new, found.pose.T_camera_points, corners)
-        self._motion_model.correct(self.keyframes[-1].T_odom_camera)
+        self._model.correct(self.keyframes[-1].T_odom_camera)
         return placed
 
     def _px_s(self, T_odom_camera: F64, depth: float) -> F64:
@@ -334,14 +322,14 @@ class Odometry:
         gap_s = 1e-9 * self._gap_ns
         if not (0.0 < gap_s < NEAR_S and np.isfinite(depth)):
             return np.zeros(2)
-        return np.asarray(self.K[0, 0] / gap_s * self._motion_model.across(T_odom_camera, depth))
+        return np.asarray(self.K[0, 0] / gap_s * self._model.across(T_odom_camera, depth))
 
     def _accept_two_views(self, new: Frame, found: TwoViewPose) -> Frame:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
         key, T_camera_odom, uv, ok = found
         placed = self._add_keyframe(new, T_camera_odom, [(key, uv, ok)])
-        self._motion_model.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
+        self._model.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
         return placed
 
     def _add_keyframe(

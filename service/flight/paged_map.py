@@ -49,7 +49,6 @@ class PagedMap(VoxelMap):
 
     @property
     def tiles_on_disk(self) -> int:
-        """How many tiles are on disk now."""
         return len(self._away)
 
     def fresh(self, depth: DepthMap) -> Bool:

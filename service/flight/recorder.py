@@ -79,14 +79,12 @@ class PublishedFrames:
                 raise OutsideError(why) from error
 
     def rows(self) -> Iterator[Any]:
-        """The rows of all frames, in order."""
         self._file.seek(0)
         while row := self._file.read(FRAME.itemsize):
             yield np.frombuffer(row, FRAME)[0]
         yield from (_whole(*one) for one in self._fresh)
 
     def close(self) -> None:
-        """Release the file."""
         self._file.close()
 
 
@@ -176,7 +174,6 @@ class Recorder:
         return summary
 
     def _write_due(self) -> None:
-        """Write the poses that wait for it."""
         due, self._due = self._due, []
         if due:
             self.store.add_poses(due)
@@ -311,7 +308,6 @@ class Recorder:
             self._on_keyframe(keyframe)
 
     def _repose(self, seq: int, pose: Pose) -> Repose:
-        """A keyframe's better pose as it is stored and sent."""
         self._revisions[seq] += 1
         growth = pose.scale / self._first_scale[seq]
         return Repose(seq, self._revisions[seq], pose.T_world_camera, growth, pose.covariance)
@@ -394,7 +390,6 @@ class FrameTags:
             self._give_up(error)
 
     def close(self) -> None:
-        """End the file."""
         file, self._file = self._file, None
         if file is not None:
             try:

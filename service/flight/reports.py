@@ -50,11 +50,9 @@ class GraphWatch:
         return list(fresh.values())
 
     def sentences(self) -> list[str]:
-        """Everything that is wrong, as known now."""
         return list(self._findings().values())
 
     def _findings(self) -> dict[str, str]:
-        """Sentences by kind."""
         counts = self._graph.counts
         out = {
             kind: f"{counts[kind]} {text}" for kind, text in LEFT_OUT.items()

@@ -149,7 +149,6 @@ class TelemetryCheck:
         return off_ms if is_off else None
 
     def finish(self) -> None:
-        """Look once more, at the end of a scan."""
         if self._history is not None and self._seen_ns is not None:
             self._look(self._history, self._seen_ns)
 
