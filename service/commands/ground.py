@@ -146,7 +146,7 @@ def ground(given: GroundOptions) -> None:
 
     config, claim = given.receiver(), Claim()
     if not claim.take(config.store):
-        raise InputError(f"another ground station works with {config.store}; give another --store")
+        raise InputError(f"another station or daemon works in {config.store}; give another --store")
     try:
         _run(given, config)
     finally:
