@@ -19,8 +19,7 @@ T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
 
-LOOK_S = 0.2
-"""How often one who waits for work looks whether it ends."""
+LOOK_S = 0.2  # how often one who waits for work looks whether it ends
 
 
 class Channel(Generic[T]):
@@ -213,8 +212,7 @@ def _end(future: Future[Out], rest: Callable[[], Out]) -> Callable[[], object]:
         return partial(future.set_exception, error)
 
 
-_Job = Callable[[], Callable[[], object]]
-"""Returns how to pass on what it made."""
+_Job = Callable[[], Callable[[], object]]  # returns how to pass on what it made
 
 
 class _Half:

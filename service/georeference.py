@@ -150,8 +150,7 @@ def line_geometry(places: F64) -> dict[str, Any]:
     return {"type": "MultiLineString", "coordinates": [part.tolist() for part in parts]}
 
 
-Feature = tuple[dict[str, Any], dict[str, Any]]
-"""Properties and geometry in GeoJSON."""
+Feature = tuple[dict[str, Any], dict[str, Any]]  # properties and geometry in GeoJSON
 
 
 def geojson_of(features: Iterable[Feature]) -> str:

@@ -24,11 +24,8 @@ from service.errors import InputError
 
 log = logging.getLogger(__name__)
 
-Peer = tuple[str, int]
-"""Address and port at the other end."""
-
-DESCRIPTORS = 8192
-"""Descriptors that a service requests; its systemd unit has the same number."""
+Peer = tuple[str, int]  # address and port at the other end
+DESCRIPTORS = 8192  # descriptors that a service requests; its systemd unit has the same number
 
 
 @dataclass(frozen=True, slots=True)

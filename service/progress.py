@@ -14,8 +14,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-MIN_SHARE, MIN_S = 0.02, 2.0
-"""Before this much is done the time left is a guess."""
+MIN_SHARE, MIN_S = 0.02, 2.0  # before this much is done the time left is a guess
 
 
 class CancelledError(Exception):

@@ -10,8 +10,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-HIDDEN = "***"
-"""Replaces a secret."""
+HIDDEN = "***"  # replaces a secret
 
 SECRET_KEYS = frozenset({"mavlink.signing_key", "datalink.tls_key"})
 """Configuration keys whose whole value is secret, as ``section.key``."""

@@ -31,10 +31,8 @@ log = logging.getLogger(__name__)
 
 MAX_RESTARTS, WINDOW_S = 5, 60.0
 """A worker that fails more often than this within the window is not restarted again."""
-MAX_FAILED = 100
-"""Workers that are no longer restarted, kept for the report."""
-PAUSE_S, LOOK_S = 0.5, 0.5
-"""Pause between a fault and the restart; between two looks at a process."""
+MAX_FAILED = 100  # workers that are no longer restarted, kept for the report
+PAUSE_S, LOOK_S = 0.5, 0.5  # pause between a fault and the restart; between two looks at a process
 NICE = 10
 DROP, WAIT = "drop oldest", "wait"
 """Policy of a full queue: drop its oldest entry, or make the filling thread wait."""
@@ -275,12 +273,10 @@ class Workers:
 
 
 _ALL: weakref.WeakSet[Workers] = weakref.WeakSet()
-_ALL_LOCK = threading.Lock()
-"""A set must not change while it is iterated."""
+_ALL_LOCK = threading.Lock()  # a set must not change while it is iterated
 _PROCESSES: list[tuple[str, subprocess.Popen[bytes]]] = []
 
-PROCESS = Workers()
-"""The workers without a closer supervisor."""
+PROCESS = Workers()  # the workers without a closer supervisor
 
 
 WITHOUT_THE_CURRENT_FOLDER = (

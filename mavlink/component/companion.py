@@ -50,8 +50,7 @@ HEARD = numbers_of((*READERS, "HEARTBEAT", "SYSTEM_TIME", "TIMESYNC")) | TO_ONE 
 
 
 TICK_S, IDLE_TICK_S = 0.01, 0.04
-FAST_US = 400_000
-"""Streams with a shorter interval, down to 20 ms, need the short pause."""
+FAST_US = 400_000  # streams with a shorter interval, down to 20 ms, need the short pause
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,8 +96,7 @@ class ScanStatus:
         return self.phase in (Phase.WAITING, Phase.SCANNING, Phase.PAUSED)
 
 
-Place = tuple[float, float, float]
-"""Latitude and longitude in degrees, metres above mean sea level."""
+Place = tuple[float, float, float]  # latitude and longitude in degrees, metres above mean sea level
 
 
 @dataclass(frozen=True, slots=True)

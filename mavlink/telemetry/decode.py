@@ -21,8 +21,7 @@ from mavlink.telemetry.samples import (
     TerrainSample,
 )
 
-Message = Any
-"""A message object of a pymavlink dialect."""
+Message = Any  # a message object of a pymavlink dialect
 
 DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 HDOP_TO_M = 1.5  # range error of one sigma per unit of HDOP

@@ -63,8 +63,7 @@ TURN_RAD_S2, ACCELERATION_M_S2 = 1.5, 1.0
 WITH_RATES = 0.5
 """Share of an angle's error that is left where its rates are known: on logs 0.3 to 0.75."""
 
-BETWEEN_NS = 100_000_000
-"""A rotation that is compared with images is wanted at least so often."""
+BETWEEN_NS = 100_000_000  # a rotation that is compared with images is wanted at least so often
 
 MAX_AGL_M = 1e5  # senders fill in any float; the datalink takes no higher pose
 

@@ -282,8 +282,7 @@ MAX_GAP_S = 0.45
 """Attitudes further apart are not interpolated: a ground station's log has three or four a second,
 and a camera swings at up to 1 Hz."""
 
-FINER = 4
-"""Steps from one attitude to the next."""
+FINER = 4  # steps from one attitude to the next
 
 AVERAGED = 6
 """Steps over which attitudes are averaged: over one and a half spacings the noise of the mean is as

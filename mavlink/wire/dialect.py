@@ -14,8 +14,7 @@ from pymavlink.generator import mavcrc  # type: ignore[import-untyped]
 dialect: Any = ardupilotmega
 """Message classes, enums as module constants, ``mavlink_map`` from number to class."""
 
-x25crc: Any = mavcrc.x25crc
-"""CRC-16/MCRF4XX; compiled when fastcrc is installed."""
+x25crc: Any = mavcrc.x25crc  # CRC-16/MCRF4XX; compiled when fastcrc is installed
 
 COMMAND_CANCEL = 80
 

@@ -16,8 +16,7 @@ MAGIC_V2 = 0xFD
 SIGNATURE_LENGTH = 13
 SIGNED = 0x01
 
-Message = Any
-"""A message object of a pymavlink dialect."""
+Message = Any  # a message object of a pymavlink dialect
 
 
 class Packet(NamedTuple):

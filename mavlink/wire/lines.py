@@ -24,16 +24,14 @@ from mavlink.wire.dialect import dialect
 
 log = logging.getLogger(__name__)
 
-MAX_LINES, LONGEST_LINE = 64, 512
-"""Of a datagram; the rest is dropped."""
+MAX_LINES, LONGEST_LINE = 64, 512  # of a datagram; the rest is dropped
 
 COLUMNS = (
     "time_s", "lat_deg", "lon_deg", "alt_amsl_m", "relative_alt_m", "sigma_h_m", "sigma_v_m",
     "hdop", "roll_deg", "pitch_deg", "yaw_deg", "gimbal_roll_deg", "gimbal_pitch_deg",
     "gimbal_yaw_deg",
 )  # fmt: skip
-HEADERS = ("lat_deg", "yaw_deg", "gimbal_yaw_deg")
-"""A header has one of them."""
+HEADERS = ("lat_deg", "yaw_deg", "gimbal_yaw_deg")  # a header has one of them
 MAX_COLUMNS = 64
 
 SYSTEM, AUTOPILOT, GIMBAL = 1, 1, 154

@@ -18,8 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 
-Way = tuple[int, tuple[str, int] | None]
-"""A port's descriptor, and the address of a datagram."""
+Way = tuple[int, tuple[str, int] | None]  # a port's descriptor, and the address of a datagram
 Beat = tuple[float, list[tuple[Way, bytes]]]
 """When to send, in monotonic seconds, and what on which way."""
 

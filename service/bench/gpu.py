@@ -20,8 +20,7 @@ from service.bench.stereo import scene
 GUIDE = (2704, 1520)
 DEPTH = (1280, 720)
 PAIRS = (1, 4)
-SIZE, LABELS = (320, 180), 16
-"""Size (w, h) and labels of the rectified pair."""
+SIZE, LABELS = (320, 180), 16  # size (w, h) and labels of the rectified pair
 
 
 def run(options: BenchOptions) -> list[BenchResult]:

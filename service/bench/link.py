@@ -32,10 +32,8 @@ from service.stream.store import ScanStore
 
 SIZE_PX = (320, 180)
 SHARE = 0.65
-SETTLE_S = 3.0
-"""Time after a cut that is reported on its own: TCP and Zenoh find each other again."""
-PATIENCE_S = 20.0
-"""How long drone and ground may take to find each other before take-off."""
+SETTLE_S = 3.0  # time after a cut that is reported on its own: TCP and Zenoh find each other again
+PATIENCE_S = 20.0  # how long drone and ground may take to find each other before take-off
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +52,7 @@ FLEET = Trial(LinkModel(1000.0, 0.05, 0.0), flight_s=12.0, drones=10)
 Times = dict[tuple[str, str, int], float]
 """When the records of a drone, of a kind and by their number, were made, or came."""
 
-Row = tuple[str, float, str]
-"""A figure, its value and unit."""
+Row = tuple[str, float, str]  # a figure, its value and unit
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,7 @@ QUEUE_BYTES = 32_768
 """The radio's own buffer; TCP is held back beyond it."""
 SOCKET_BYTES = 4096
 """Receive buffer of the relay: what a sender's system holds is in the sender's buffer."""
-ESTABLISHED = 1
-"""State of an open connection in TCP_INFO."""
+ESTABLISHED = 1  # state of an open connection in TCP_INFO
 FIRST_WAIT_S, MIN_WAIT_S = 1.0, 0.2
 """TCP's first wait for an answer to a call, and the least for data."""
 

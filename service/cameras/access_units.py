@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import av
 
-SURE = 5
-"""Packets at the start of a stream that end with an image, before one counts as whole."""
+SURE = 5  # packets at the start of a stream that end with an image, before one counts as whole
 
 LARGEST_BYTES = 1 << 23
 """Of a packet, and so of a coded image; without a limit given, FFmpeg's demuxer cuts at 200 KiB."""
 
 
-LONGEST_HEAD = 4096
-"""Bytes of parameter sets and the like in packets of their own."""
+LONGEST_HEAD = 4096  # bytes of parameter sets and the like in packets of their own
 
 START = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 """The start code of a NAL unit, and its first byte."""

@@ -17,11 +17,8 @@ from recon.types import Shutter
 from service.cameras import open_container
 
 HANDLER = "DJI meta"
-MAX_BYTES = 1 << 16
-"""Of a sample, that are read; the clip comes first."""
-
-MAX_PACKETS = 500
-"""Packets of all tracks in which the first sample must lie."""
+MAX_BYTES = 1 << 16  # of a sample, that are read; the clip comes first
+MAX_PACKETS = 500  # packets of all tracks in which the first sample must lie
 
 MAX_FIELDS = 256
 MAX_READOUT_NS = 50_000_000

@@ -28,8 +28,7 @@ from service.cameras.xmp import xmp_values
 DEFAULT_SIGMA_H_M, MAX_SIGMA_M = 5.0, 1000.0
 NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,6})?Z(?![A-Za-z0-9])")
 EXIF_HEAD = b"Exif\0\0"
-EXIF_BYTES = 1 << 22
-"""Of a file's EXIF that is read; cameras write 64 KiB, and a maker's note."""
+EXIF_BYTES = 1 << 22  # of a file's EXIF that is read; cameras write 64 KiB, and a maker's note
 
 FINE_M, DIFFER_M = 0.1, 1.0
 """Steps of a stated value that make no difference, and a difference of two that does."""

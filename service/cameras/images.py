@@ -25,15 +25,11 @@ from service.errors import InputError
 
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"))
 
-MAX_ENTRIES = 2000
-"""Entries of subfolders in which images are sought where a folder has none."""
+MAX_ENTRIES = 2000  # entries of subfolders in which images are sought where a folder has none
 
 SECOND_NS = 1_000_000_000
-ZOOM = 0.03
-"""Relative tolerance of the focal lengths of one camera."""
-
-AS_OFTEN = 0.9
-"""Of two cameras of one drone, one misses some images at times."""
+ZOOM = 0.03  # relative tolerance of the focal lengths of one camera
+AS_OFTEN = 0.9  # of two cameras of one drone, one misses some images at times
 
 FEW_PIXELS = 0.1
 """Share of another camera's pixels below which one does not count: a zoom camera has up to four
@@ -44,8 +40,7 @@ SHOWN, WIDER, LOOKED_AT = (0.5, 99.5), 0.5, 5
 that are shown; the share of those that is shown beyond them on each side; and how many images
 tell."""
 
-WIDE = 1 << 15
-"""Where more levels of 16 bits are shown than these it is a photo, and all are."""
+WIDE = 1 << 15  # where more levels of 16 bits are shown than these it is a photo, and all are
 
 MAX_PAN_DEG = 30.0
 """Gimbals follow the nose: where images head further off it than that, their heading is wrong, as
@@ -65,8 +60,7 @@ it; the other way is as likely, and the same to a lens that is alike all around.
 ZONE_NS = 900 * SECOND_NS  # time zones are multiples of a quarter of an hour
 
 
-Still = tuple[Path, Tags]
-"""A file and its tags."""
+Still = tuple[Path, Tags]  # a file and its tags
 
 
 class ImagesSource(CameraSource):

@@ -23,15 +23,13 @@ if TYPE_CHECKING:
 
 DIAGONAL_35MM = 43.2666
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-MAX_CROP_ONE_INCH = 3.2
-"""Above this crop factor a sensor is smaller than one inch (2.7)."""
+MAX_CROP_ONE_INCH = 3.2  # above this crop factor a sensor is smaller than one inch (2.7)
 
 MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 """Focal length over the longer side of the image; a tag outside this range is wrong, and
 with a view so narrow vision cannot tell a turn of the camera from its distance."""
 
-SAME_SHAPE = 0.005
-"""Relative tolerance of aspect ratios: sizes are whole pixels."""
+SAME_SHAPE = 0.005  # relative tolerance of aspect ratios: sizes are whole pixels
 
 SIGMA_FOCAL = 0.05
 """Relative sigma of a focal length in tags: it is that of the lens's model, rounded, and of images

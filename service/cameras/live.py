@@ -428,8 +428,7 @@ def _launched(
     return Paced(LiveSource(opened, description, config, listens))
 
 
-OUTPUT_BYTES = 1 << 18
-"""Read at once from a command: raw video is 40 MB/s."""
+OUTPUT_BYTES = 1 << 18  # read at once from a command: raw video is 40 MB/s
 
 
 class _Command:

@@ -17,17 +17,13 @@ from service.cameras.source import GeoTag
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.georeference import LocalFrame
 
-ASSUMED_AGL_M = 50.0
-"""Assumed height above ground without any other scale; the scan states it."""
+ASSUMED_AGL_M = 50.0  # assumed height above ground without any other scale; the scan states it
 
 ABOVE_HOME_SHARE = 0.25
 """Relative sigma of a height above the take-off point, used as a height above ground."""
 
-AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
-"""Below these a vehicle is on the ground."""
-
-MIN_SIGMA_M, MAX_ALTITUDE_M = 0.005, 1e5
-"""Limits of plausible accuracies and heights in tags."""
+AT_REST_M_S, ON_GROUND_M = 0.3, 2.0  # below these a vehicle is on the ground
+MIN_SIGMA_M, MAX_ALTITUDE_M = 0.005, 1e5  # limits of plausible accuracies and heights in tags
 
 TAG_HEIGHT_M, BAROMETER_M = 50.0, 5.0
 """Sigma of an altitude in a still's tags: of a camera's receiver, and of a drone that also writes
@@ -40,8 +36,7 @@ receivers two to three."""
 CORRECTED_M = 0.1
 """A receiver that states less has corrections of a base: its height does not wander by itself."""
 
-NO_ALTITUDE_M = 1000.0
-"""Sigma of the height of a position without an altitude."""
+NO_ALTITUDE_M = 1000.0  # sigma of the height of a position without an altitude
 
 TURN_NS = 20_000_000
 """Before and after an exposure: how telemetry's attitude changes there is the camera's turn."""
@@ -49,8 +44,7 @@ TURN_NS = 20_000_000
 RATE_RAD_S, CHANGE_RAD_S2 = 0.02, 1.0
 """Sigma of a turn by telemetry, and how fast it changes between two attitudes."""
 
-NO_YAW_RAD = 3.0
-"""Sigma of an unknown heading."""
+NO_YAW_RAD = 3.0  # sigma of an unknown heading
 
 
 @dataclass(frozen=True, slots=True)

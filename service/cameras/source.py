@@ -185,8 +185,7 @@ def _read(
     return PROCESS.start(row, read, queue.__len__, lambda: queue.lag_s)
 
 
-CLOSE_S = 5.0
-"""For a recording's reader to end."""
+CLOSE_S = 5.0  # for a recording's reader to end
 
 
 class Paced(Relayed):

@@ -16,11 +16,8 @@ from recon.parallel import run_parallel
 from recon.tracking.sift_features import SIGNATURE_WIDTH_PX, alike, signature
 from recon.types import F64, U8
 
-MOST = 200
-"""Stills that are compared, each with each: 20,000 pairs in two minutes on one core."""
-
-CHANCE = 5
-"""Features that images of different places seem to share."""
+MOST = 200  # stills that are compared, each with each: 20,000 pairs in two minutes on one core
+CHANCE = 5  # features that images of different places seem to share
 
 AT_RANDOM = 0.25
 """Where a path along the names is longer than the shortest by less than this share of what a random

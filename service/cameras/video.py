@@ -34,17 +34,13 @@ MAX_PIXELS = 1 << 27
 
 OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 
-PANORAMAS = frozenset((".360", ".insv"))
-"""Recordings of GoPro and Insta360 that show all around."""
+PANORAMAS = frozenset((".360", ".insv"))  # recordings of GoPro and Insta360 that show all around
 
 RESTART_NS = 1_000_000_000
 """A time that goes back to this long after the start, at most, begins again: joined recordings."""
 
-LONGEST_NS = 366 * 86_400 * 1_000_000_000
-"""No recording is longer: a time beyond is damage."""
-
-UNEQUAL = 0.01
-"""Share by which width and height of a pixel may differ."""
+LONGEST_NS = 366 * 86_400 * 1_000_000_000  # no recording is longer: a time beyond is damage
+UNEQUAL = 0.01  # share by which width and height of a pixel may differ
 
 HEAD_BYTES = 4096
 NS_PER_S = 1_000_000_000
@@ -282,8 +278,7 @@ def decoded_frames(
             return
 
 
-LONGEST_CUE = 8192
-"""Bytes of a cue that are read; drones write a few hundred."""
+LONGEST_CUE = 8192  # bytes of a cue that are read; drones write a few hundred
 
 
 LARGEST_METADATA = 1 << 20

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 from xml.parsers import expat
 
-MAX_BYTES = 1 << 18
-"""Of a packet that is read; those of DJI have 10 KiB."""
+MAX_BYTES = 1 << 18  # of a packet that is read; those of DJI have 10 KiB
 
 PREFIXES = frozenset(("drone-dji", "drone-parrot", "drone"))
 """Autel's names are those of DJI with the prefix drone."""

@@ -22,8 +22,7 @@ from service.workers import PROCESS
 if TYPE_CHECKING:
     from service.config import Config
 
-QUIET_S = 2.0
-"""After so long without a line a reader asks whether it still works."""
+QUIET_S = 2.0  # after so long without a line a reader asks whether it still works
 
 
 def choices(values: Iterable[str]) -> Callable[[str], list[str]]:

@@ -42,11 +42,8 @@ log = logging.getLogger(__name__)
 MIN_STILLS, MAX_STILLS = 6, 200
 """Fewer determine nothing; the images of more do not fit into memory."""
 
-WIDTH_PX = 1920
-"""Width at which stills are matched, at most."""
-
-FIX_SIGMAS = 2.0
-"""What errors of fixes count for: they are common to neighbours."""
+WIDTH_PX = 1920  # width at which stills are matched, at most
+FIX_SIGMAS = 2.0  # what errors of fixes count for: they are common to neighbours
 
 FASTER, SLACK_SIGMAS = 2.0, 5.0
 """Times the vehicle's highest speed that the track between two stills may have, and sigmas of a

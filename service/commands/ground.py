@@ -26,8 +26,7 @@ DEFAULT_PORT = 7447
 RADIO_REFRESH_S = 15.0
 NOTIFY_S = 1.0
 SHOW_S = 2.0
-CLOSING_S = 900.0
-"""Writing deliverables at the end may take so long; then the init system ends it."""
+CLOSING_S = 900.0  # writing deliverables at the end may take so long; then the init system ends it
 
 TokenFile = Annotated[
     Path | None,

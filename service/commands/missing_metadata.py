@@ -44,11 +44,8 @@ log = logging.getLogger(__name__)
 VIEWS = 25
 """Number of stills about the middle of a flight, or of a video's first keyframes, that are used."""
 
-MIN_STILLS = 6
-"""Fewer stills do not determine a lens."""
-
-MAX_FRAMES = 5400
-"""Of a video, in which its first keyframes are sought."""
+MIN_STILLS = 6  # fewer stills do not determine a lens
+MAX_FRAMES = 5400  # of a video, in which its first keyframes are sought
 
 ASSUMED = Lens(0.5 / math.tan(math.radians(35.0)), sigma_focal=0.2)
 """70 degrees across; cameras of drones have 60 to 86."""

@@ -18,8 +18,7 @@ from service.stream.records import ScanHeader
 from service.stream.store import header_of
 from service.stream.validity import summary_from_json
 
-SCANS = 20
-"""The latest scans that are looked at."""
+SCANS = 20  # the latest scans that are looked at
 
 
 class Measured(NamedTuple):

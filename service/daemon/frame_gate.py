@@ -18,8 +18,7 @@ from service.daemon.stored_image import image_name, store_image
 
 log = logging.getLogger(__name__)
 
-KEEP_EVERY_NS = 200_000_000
-"""Interval between stored images; 2 m of flight at 10 m/s."""
+KEEP_EVERY_NS = 200_000_000  # interval between stored images; 2 m of flight at 10 m/s
 
 
 class FrameGate(Relayed):

@@ -12,13 +12,11 @@ from enum import IntEnum
 
 from service.config import ComputeConfig
 
-STRIDE = 2
-"""From LOWER_RATE on, one of this many frames is tracked."""
+STRIDE = 2  # from LOWER_RATE on, one of this many frames is tracked
 
 NARROWER = 0.7
 
-GRACE_S = 10.0
-"""A scan that has just begun lags because of its start."""
+GRACE_S = 10.0  # a scan that has just begun lags because of its start
 
 
 class Level(IntEnum):
@@ -49,12 +47,10 @@ class MachineReadings:
     memory_free_mib: float | None = None  # below the limit of the service or the machine
 
 
-COOLER_C = 8.0
-"""So far below ``compute.hottest_c`` a step up is tried."""
+COOLER_C = 8.0  # so far below compute.hottest_c a step up is tried
 LATE_VIEWS, LATE_FRAMES, OLDEST_S = 0.25, 0.6, 1.5
 """Tolerated shares of late views and missed frames, and age of a frame as its processing begins."""
-HOPELESS = 2.5
-"""At this multiple of them images are only recorded."""
+HOPELESS = 2.5  # at this multiple of them images are only recorded
 PATIENCE_S, HEAT_PATIENCE_S = 6.0, 20.0
 """Of overload before a step down, and between two; of heat, since cooling is slow."""
 CALM_S, LONGEST_CALM_S = 30.0, 240.0

@@ -41,20 +41,17 @@ from service.workers import PROCESS, row_of, running
 
 log = logging.getLogger(__name__)
 
-STUCK_S = 10.0
-"""A scan without a processed frame for this long is reported as critical."""
+STUCK_S = 10.0  # a scan without a processed frame for this long is reported as critical
 
 HUNG_S = row_of("scan").deadline_s or 20.0
 """Work on one frame or view for this long is a hang: the watchdog is no longer fed."""
 
-CLOSING_S = 120.0
-"""Closing a scan without any progress for this long is a hang, too."""
+CLOSING_S = 120.0  # closing a scan without any progress for this long is a hang, too
 
 PROGRESS_S = 1.5
 """Closing counts as progressing within this time of its last step; checked every second."""
 
-HOUSEKEEPING_S = 2.0
-"""Interval between two checks of the machine, its memory and its disk."""
+HOUSEKEEPING_S = 2.0  # interval between two checks of the machine, its memory and its disk
 
 COMPILING_S = 180.0
 """The same before anything is compiled, where ``skyrelief warm-up`` has not been run."""

@@ -11,8 +11,7 @@ from enum import Enum
 
 from mavlink.component.control import Phase
 
-FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
-"""Waits between attempts at a scan."""
+FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0  # waits between attempts at a scan
 
 
 class State(Enum):

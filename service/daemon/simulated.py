@@ -24,8 +24,7 @@ from service.workers import PROCESS, Worker, python_command, run_process
 
 log = logging.getLogger(__name__)
 
-OPERATOR = "udpout:127.0.0.1:14550"
-"""Default endpoint of ``skyrelief ctl`` and ground stations."""
+OPERATOR = "udpout:127.0.0.1:14550"  # default endpoint of skyrelief ctl and ground stations
 REPORT_EVERY = 25  # frames between two progress lines
 
 

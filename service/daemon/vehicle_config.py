@@ -20,8 +20,7 @@ from mavlink.wire.signing import read_key
 from service.config import Config, change
 from service.errors import InputError
 
-KEEP_S = 120.0
-"""Length of the live history; frames wait for the pipeline for less than that."""
+KEEP_S = 120.0  # length of the live history; frames wait for the pipeline for less than that
 
 
 def vehicle_config(config: Config) -> VehicleConfig:

@@ -25,8 +25,7 @@ MAX_DIRECTORY_BYTES, MAX_TILE_BYTES = 1 << 20, 1 << 23
 MAX_DIRECTORIES, DEEPEST_DIRECTORY = 16, 4
 MAX_ZOOM = 30
 MAX_SIDE_PX = 4096
-MAX_STEPS = 20_000_000
-"""Instructions of SQLite for one question; an index needs some hundred."""
+MAX_STEPS = 20_000_000  # instructions of SQLite for one question; an index needs some hundred
 FAULTS = (sqlite3.Error, OSError, ValueError, struct.error, zlib.error)
 
 

@@ -16,8 +16,7 @@ from starlette.responses import Response
 from service.errors import InputError
 from service.ground.guard import note
 
-BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {}
-"""Bodies of the endpoints that take one."""
+BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {}  # bodies of the endpoints that take one
 
 
 class Body(msgspec.Struct, forbid_unknown_fields=True):

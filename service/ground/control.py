@@ -34,8 +34,7 @@ from service.scans.writing import write_whole
 from service.stream.store import ScanStore
 
 _WRITING = threading.Lock()
-MAX_POINTS, MAX_MARKS = 1000, 20_000
-"""The page asks for all of them again after each mark."""
+MAX_POINTS, MAX_MARKS = 1000, 20_000  # the page asks for all of them again after each mark
 
 Px = Annotated[float, msgspec.Meta(ge=-1.0, le=100_000.0)]
 

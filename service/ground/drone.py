@@ -27,16 +27,12 @@ log = logging.getLogger(__name__)
 
 REPORT_S = 1.0
 REPORT_IDLE_S = 3.0
-BUSY_S = 10.0
-"""A scan of which something was heard so lately, and that lacks something, stays open."""
-CLOSE_AFTER_S = 600.0
-"""A scan without data for so long is written and closed; a whole one sooner."""
-REWRITE_S = 60.0
-"""Deliverables that the disk refused are written again after so long."""
+BUSY_S = 10.0  # a scan of which something was heard so lately, and that lacks something, stays open
+CLOSE_AFTER_S = 600.0  # a scan without data for so long is written and closed; a whole one sooner
+REWRITE_S = 60.0  # deliverables that the disk refused are written again after so long
 MAX_INTRODUCTIONS = 32
 """Scans without a folder whose header is waited for; a drone offers 21 at once."""
-MAX_CLOSED = 200
-"""Closed scans whose last figures are kept."""
+MAX_CLOSED = 200  # closed scans whose last figures are kept
 UNREADABLE_REST_S, MAX_UNREADABLE = 60.0, 64
 
 

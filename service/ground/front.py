@@ -33,8 +33,7 @@ LIMITS = ListenerLimits(total=512, per_address=128, wait_s=10.0)
 MAX_HANDSHAKES, MAX_OF_ADDRESS, KEPT = 48, 16, 12
 """Connections that Zenoh has and has not admitted yet: in all, of one address, and more for
 addresses with none. Others wait."""
-HANDSHAKE_S = 12.0
-"""Zenoh has given a handshake up by then."""
+HANDSHAKE_S = 12.0  # Zenoh has given a handshake up by then
 ADMITTED = 2
 """Replies of Zenoh after which it has checked the other end: the second of TLS needs its
 certificate."""

@@ -145,8 +145,7 @@ def kept_token(store: Path) -> str:
 AUDIT_FILE = "audit.jsonl"
 MAX_AUDIT_BYTES = 8_000_000
 MAX_TEXT = 200
-NOTED = "skyrelief.change"
-"""Key of a request's scope for the notes of its endpoint."""
+NOTED = "skyrelief.change"  # key of a request's scope for the notes of its endpoint
 
 
 class AuditLog:
@@ -214,14 +213,12 @@ def _short(value: Any) -> Any:
     return str(value)[:MAX_TEXT]
 
 
-MAX_PATH = 1000
-"""Letters of an address before its query; the longest of ours has some 300."""
+MAX_PATH = 1000  # letters of an address before its query; the longest of ours has some 300
 MAX_BODY_BYTES = 65_536
 UPLOAD, MAX_UPLOAD_BYTES = "/api/upload", 16 << 30
 SURVEY, MAX_SURVEY_BYTES = "/control-points", 24_000_000
 """What the paths end with whose bodies may be larger; two files of control points, escaped."""
-MIN_UPLOAD_HZ = 20_000
-"""Bytes a second that a large body comes with at least."""
+MIN_UPLOAD_HZ = 20_000  # bytes a second that a large body comes with at least
 CLOSE = {"connection": "close"}
 
 

@@ -69,8 +69,7 @@ again."""
 
 MAX_LIVE_VIEWS = {False: 8, True: 16}
 """Without a token, and with one. uvicorn's limit is one for all requests together."""
-ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
-"""Rate limit of orders to the vehicle; a stop always passes."""
+ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10  # rate limit of orders to the vehicle; a stop always passes
 
 NO_PAGE = (
     "<!doctype html><meta charset=utf-8><title>skyrelief</title><h1>skyrelief</h1>"
@@ -212,8 +211,7 @@ def _operation(endpoint: Callable[..., Any], method: str) -> dict[str, Any]:
     return out
 
 
-CODES = {MissingError: 404, ConflictError: 409, OutsideError: 503}
-"""Of other refusals it is 400."""
+CODES = {MissingError: 404, ConflictError: 409, OutsideError: 503}  # of other refusals it is 400
 
 
 def _said(request: HTTPConnection, error: Exception) -> Response:

@@ -19,10 +19,8 @@ from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
-HEADER_REST_S = 1.0
-"""Interval between two requests for the header."""
-MAX_KEPT_BYTES = 1 << 18
-"""Items that may come before the header."""
+HEADER_REST_S = 1.0  # interval between two requests for the header
+MAX_KEPT_BYTES = 1 << 18  # items that may come before the header
 
 
 class Introduction:
@@ -75,15 +73,13 @@ class Introduction:
 SMALL, FINE = range(2)
 """The two requests that may be under way: small records and coarse layers; fine layers."""
 
-GRACE_S = 1.0
-"""An item that the drone has had for less than this may still arrive unrequested."""
+GRACE_S = 1.0  # an item that the drone has had for less than this may still arrive unrequested
 STALL_S = 4.0
 SILENCE_S = 4.0
 """A drone silent for so long was away, or its link was down; it has forgotten all requests."""
 TIMED, MAX_TIMED = 64, 4096
 """Number of new layers of one kind in a head that are timed, the newest, and of all."""
-REST_S = 2.0
-"""Pause after a request without an answer."""
+REST_S = 2.0  # pause after a request without an answer
 
 BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8, "image": 8}
 """Items of a kind that one request names, in the order of asking."""

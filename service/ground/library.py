@@ -303,8 +303,7 @@ def _files(folder: Path) -> list[dict[str, Any]]:
     return out
 
 
-JOINERS = "\u200c\u200d"
-"""Invisible characters that some scripts need within a word."""
+JOINERS = "\u200c\u200d"  # invisible characters that some scripts need within a word
 
 
 def _title(title: Any) -> str:

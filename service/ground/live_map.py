@@ -35,8 +35,7 @@ WIDE = SIDE + 2 * MARGIN
 EQUATOR_M = 2.0 * math.pi * 6378137.0
 MAX_ZOOM = 24
 HOLE_PX = 4
-GAP_PX = 12
-"""Of an image: what lies between measured pixels, up to twice so far apart, is shown."""
+GAP_PX = 12  # of an image: what lies between measured pixels, up to twice so far apart, is shown
 
 UNMEASURED_M = 1e6
 """Sigma of a place that images show and nothing measured, and one more for each pixel from there to
@@ -44,8 +43,7 @@ a measured one: the nearest is shown."""
 
 MAX_TILES = 150
 
-Tile = tuple[int, int, int]
-"""Zoom, column from west, row from north."""
+Tile = tuple[int, int, int]  # zoom, column from west, row from north
 
 State = tuple[int, int]
 """Of a keyframe, as :meth:`ScanStore.states` gives it."""

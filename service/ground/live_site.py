@@ -33,17 +33,12 @@ from service.workers import Worker, guarded, python_command, run_process
 
 log = logging.getLogger(__name__)
 
-FILE = ".live-site.json"
-"""Where the scans in flight are shown; below the receiver's folder."""
+FILE = ".live-site.json"  # where the scans in flight are shown; below the receiver's folder
 
 POLL_S = 0.25
-GROWING_S = 60.0
-"""A scan that did not change for so long is no longer in flight."""
-MAX_FLYING, MAX_SCANS = 16, 48
-"""Scans in flight, and all that are followed."""
-
-REFUSED_S = 3.0
-"""A scan that cannot be followed yet is looked at again after so long."""
+GROWING_S = 60.0  # a scan that did not change for so long is no longer in flight
+MAX_FLYING, MAX_SCANS = 16, 48  # scans in flight, and all that are followed
+REFUSED_S = 3.0  # a scan that cannot be followed yet is looked at again after so long
 
 
 def run(store: Path, worker: Worker) -> None:

@@ -46,8 +46,7 @@ TERRAIN = "terrain"
 RASTERS = {"ortho": "ortho.tif", "dsm": "dsm.tif", "contours": "dsm.tif", TERRAIN: "dsm.tif"}
 """The layers that a finished scan may have as rasters."""
 
-LAYERS = ("ortho", "dsm", "contours", "coverage")
-"""Those that are seen as they are."""
+LAYERS = ("ortho", "dsm", "contours", "coverage")  # those that are seen as they are
 INK = (40, 60, 110)  # BGR of contours
 SMOOTH_PX = 1.5
 CONTOUR_PX = 4.0
@@ -58,8 +57,7 @@ KML_TILES = 4
 THUMBNAIL_PX = 480  # of its longer side, at most
 REFRESH_S = 2
 FRESH = {"cache-control": "max-age=1"}  # an ETag needs the tile drawn first
-NOW = {"cache-control": "no-cache"}
-"""Whoever asks for the version of a map wants that of now."""
+NOW = {"cache-control": "no-cache"}  # whoever asks for the version of a map wants that of now
 
 
 def map_routes() -> list[Route]:

@@ -28,14 +28,12 @@ from service.workers import python_command, run_to_end
 log = logging.getLogger(__name__)
 
 KIND, FILE = "glb", "mesh.glb"
-MAX_POINTS = 20_000_000
-"""A larger scan has a mesh in tiles, which one page does not hold."""
+MAX_POINTS = 20_000_000  # a larger scan has a mesh in tiles, which one page does not hold
 
 BASE_BYTES, POINT_BYTES = 900 << 20, 800
 """Memory that a mesh takes, whatever its size and for each point of the cloud."""
 
-MESH_S = 7200.0
-"""One mesh may take so long; a scan may come from a stranger."""
+MESH_S = 7200.0  # one mesh may take so long; a scan may come from a stranger
 
 
 def queue_meshes(jobs: Jobs, store: Path, may_begin: Callable[[], bool]) -> None:

@@ -46,8 +46,7 @@ MIN_TOKEN_LETTERS = 16
 _warnings_pace = Pace(rate_hz=1.0, burst=10)
 """Of the web server's warnings: each malformed request makes one."""
 
-BACKLOG = 64
-"""Connections that may wait to be accepted, and that are accepted at once."""
+BACKLOG = 64  # connections that may wait to be accepted, and that are accepted at once
 
 
 @dataclass(frozen=True, slots=True)

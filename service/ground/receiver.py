@@ -42,24 +42,18 @@ log = logging.getLogger(__name__)
 ASK_TIMEOUT_S = 120.0
 RETRY_S, LOOK_AROUND_S, LOOK_S = 1.0, 3.0, 0.2
 DROP = zenoh.CongestionControl.DROP
-CHANNEL = 256
-"""Messages that may wait in the session, of one kind or to one request."""
+CHANNEL = 256  # messages that may wait in the session, of one kind or to one request
 TICK_S, MAX_REST_S = 0.1, 0.5
 """After each turn a drone's worker rests as long as it computed, at most so long: one drone never
 takes more than half of a core."""
 DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
 """An open scan holds so many; all of them together get this fraction (1/n) of the limit."""
 MAX_ITEM_BYTES, MAX_ITEMS = 8 << 20, 4096
-MAX_HEADS = 256
-"""Scans of one drone whose newest head may wait."""
-ITEM_BYTES = 200
-"""Bytes that a kept message takes beyond its payload."""
-MAX_RESTING = 256
-"""Drones without a worker whose figures are kept."""
-STRANGER_S = 1.0
-"""A drone without any scan is replaced by another after so long without a message."""
-REFUSAL_S = 60.0
-"""Interval between two warnings about a drone that is not received."""
+MAX_HEADS = 256  # scans of one drone whose newest head may wait
+ITEM_BYTES = 200  # bytes that a kept message takes beyond its payload
+MAX_RESTING = 256  # drones without a worker whose figures are kept
+STRANGER_S = 1.0  # a drone without any scan is replaced by another after so long without a message
+REFUSAL_S = 60.0  # interval between two warnings about a drone that is not received
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,8 +45,7 @@ FOLDERS = {name for _, name, _ in EXPORTERS.values() if "." not in name}
 ZIP_PART_BYTES = 1 << 20
 SEQ = re.compile(r"[0-9]{1,9}")
 
-DARK = (45, 38, 32)
-"""Where an image shows nothing, BGR."""
+DARK = (45, 38, 32)  # where an image shows nothing, BGR
 QUALITY = 85  # of JPEG, 1 to 100
 SANDBOX = {
     "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline';"

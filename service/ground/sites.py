@@ -28,17 +28,10 @@ from service.workers import Worker, guarded, python_command, run_to_end
 
 log = logging.getLogger(__name__)
 
-NEAR_M = 500.0
-"""From where a flight begins to ground that it may see."""
-
-MIN_SHARED = 0.05
-"""Minimum share of the smaller scan's extent that the other covers as well."""
-
-SIZES = 3
-"""A site takes up to so many times the disk of its scans' stores, with its files."""
-
-ALIGN_S = 7200.0
-"""One alignment may take so long."""
+NEAR_M = 500.0  # from where a flight begins to ground that it may see
+MIN_SHARED = 0.05  # minimum share of the smaller scan's extent that the other covers as well
+SIZES = 3  # a site takes up to so many times the disk of its scans' stores, with its files
+ALIGN_S = 7200.0  # one alignment may take so long
 
 MAX_SITE_BYTES = 4_000_000
 

@@ -31,25 +31,16 @@ from service.workers import Worker, Workers, guarded
 
 log = logging.getLogger(__name__)
 
-MAX_WAITING_JOBS = 20
-"""Of those asked for, and as many others."""
-
-SILENT_S = 10.0
-"""A scan from which nothing was heard for so long does not grow."""
+MAX_WAITING_JOBS = 20  # of those asked for, and as many others
+SILENT_S = 10.0  # a scan from which nothing was heard for so long does not grow
 
 KEPT = 100
-SHOWN_S = 86400.0
-"""A job that has ended is listed for so long."""
-
-LOOK_S = 0.5
-"""How often a job that may not begin yet is looked at."""
-
-CLOSE_S = 5.0
-"""Time to a running job's next step, when the station closes."""
+SHOWN_S = 86400.0  # a job that has ended is listed for so long
+LOOK_S = 0.5  # how often a job that may not begin yet is looked at
+CLOSE_S = 5.0  # time to a running job's next step, when the station closes
 
 REFINE = "refine"
-KINDS = (*EXPORTERS, REFINE)
-"""Products that a job may make."""
+KINDS = (*EXPORTERS, REFINE)  # products that a job may make
 
 
 @dataclass(slots=True, eq=False)

@@ -107,8 +107,7 @@ def folder_bytes(folder: Path) -> int:
     return total
 
 
-DRONES, SITES = "drones", DRONE
-"""The folders of the drones, and of the sites, in a store."""
+DRONES, SITES = "drones", DRONE  # the folders of the drones, and of the sites, in a store
 
 
 def drone_folder(store: Path, drone: str) -> Path:
@@ -139,8 +138,7 @@ def _within(folder: Path) -> list[Path]:
         return []
 
 
-MAX_RUNS = 100
-"""Folders of scans of the same drone and time; more are not made."""
+MAX_RUNS = 100  # folders of scans of the same drone and time; more are not made
 
 
 def scan_folder(store: Path, drone: str, name: str) -> Path:

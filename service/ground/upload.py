@@ -49,10 +49,8 @@ UPLOADS = (
     ["--camera-model", "--telemetry", "video"],
 )  # fmt: skip
 """A video alone may hold its telemetry."""
-Part = tuple[str, int]
-"""Name and size in bytes of one uploaded file."""
-MAX_LISTING_BYTES = 4 << 20
-"""Size of an archive's table of contents, which is read whole."""
+Part = tuple[str, int]  # name and size in bytes of one uploaded file
+MAX_LISTING_BYTES = 4 << 20  # size of an archive's table of contents, which is read whole
 DONE = re.compile(r"(.*?)(?:, (\d{1,2}|100) %)?(?:, for \d+ s)?")
 """A line of progress, as :func:`service.commands.showing` writes it: the step, and what is done."""
 OWN_PATH = re.compile(rf"\S*/{re.escape(TAKING)}[^/\s]+/(?:scan/|uploaded/)?")

@@ -15,8 +15,7 @@ from service.small_file import read_json
 ANNOTATIONS = "annotations.geojson"
 MAX_ANNOTATIONS = 200
 MAX_TEXT = 500
-MAX_PLACES = 50
-"""Of a measurement."""
+MAX_PLACES = 50  # of a measurement
 
 MAX_BYTES = 1_000_000
 

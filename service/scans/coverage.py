@@ -28,11 +28,8 @@ from service.stream.store import ScanStore
 from service.workers import PROCESS
 
 IMAGE, FIGURES = "coverage.png", "coverage.json"
-MIN_VIEWS = 3
-"""Images of a place below which it is weak: two alone can agree on an error."""
-
-MAX_SIGMAS = 3.0
-"""A surface is weak where its sigma is this many times the scan's median."""
+MIN_VIEWS = 3  # images of a place below which it is weak: two alone can agree on an error
+MAX_SIGMAS = 3.0  # a surface is weak where its sigma is this many times the scan's median
 
 GAP, SELDOM, UNSURE = (70, 60, 220), (60, 160, 245), (90, 220, 245)  # BGR
 BEST, USUAL = (110, 190, 60), (190, 220, 160)
@@ -43,8 +40,7 @@ LEGEND = {
     "good": "measured; darker is more certain",
 }
 LARGEST_PX = 1600
-WRITE_EVERY_S = 15.0
-"""Interval at which the layer is written in flight."""
+WRITE_EVERY_S = 15.0  # interval at which the layer is written in flight
 
 
 @dataclass(frozen=True, eq=False)

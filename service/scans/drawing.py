@@ -28,8 +28,7 @@ TRACK = (40, 60, 235)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 MARGIN = 16
 LINE_PX = 24
-MIN_LINE_PX = 640
-"""Width of the text below an image that is narrower."""
+MIN_LINE_PX = 640  # width of the text below an image that is narrower
 
 SIGN_PX = 500
 """Panels this large have labels of their usual size; on larger ones labels grow, as pages show a

@@ -58,8 +58,7 @@ THUMBNAIL = "thumbnail.webp"
 WEBP = (cv2.IMWRITE_WEBP_QUALITY, 80)
 PREVIEW_CELLS = 6e6
 LONGEST_REASON = 500
-MIN_VOXEL_M, MAX_VOXEL_M = 0.01, 100.0
-"""Permitted voxel sizes in a scan's own configuration."""
+MIN_VOXEL_M, MAX_VOXEL_M = 0.01, 100.0  # permitted voxel sizes in a scan's own configuration
 NOTHING = FusedCloud(
     PointCloud(
         np.zeros((0, 3), np.float32),

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 MIN_STRIP_POINTS, STRIP_POINTS = 100_000, 4_000_000
 """Points that a core fuses at once; the sums of a strip take some hundred bytes each."""
 
-STRIPS_PER_CORE = 4
-"""The sums of one strip per core are in memory at a time."""
+STRIPS_PER_CORE = 4  # the sums of one strip per core are in memory at a time
 
 LARGEST_POINTS = 60_000_000
 """Maximum points before fusion; a scan with more gets larger voxels, and a note."""
@@ -49,8 +48,7 @@ LARGEST_POINTS = 60_000_000
 SMALLEST_VOXEL_M = 1e-3
 DEFAULT_VOXEL_M = 0.25
 
-Box = tuple[float, float, float, float]
-"""West, south, east, north, m."""
+Box = tuple[float, float, float, float]  # west, south, east, north, m
 
 EVERYWHERE: Box = (-np.inf, -np.inf, np.inf, np.inf)
 

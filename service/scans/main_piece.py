@@ -10,11 +10,8 @@ from recon.types import Keyframe
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
-Stretch = tuple[int, int]
-"""First and last keyframe."""
-
-MIN_PIECE = 3
-"""Keyframes from which on an unconnected stretch has a cloud of its own."""
+Stretch = tuple[int, int]  # first and last keyframe
+MIN_PIECE = 3  # keyframes from which on an unconnected stretch has a cloud of its own
 
 
 @dataclass(frozen=True)

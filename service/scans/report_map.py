@@ -20,8 +20,7 @@ WIDTH_PX, LARGEST_HEIGHT_PX = 860, 900
 MAX_ELLIPSES = 40
 SIGMAS = 2.0
 SMALLEST_ELLIPSE_PX = 5.0
-TEXT_PX = 22
-"""Of scale and north: a page shows the map at half its size."""
+TEXT_PX = 22  # of scale and north: a page shows the map at half its size
 TRACK, LOOP, WAITING = "#20252b", "#1a5fd0", "#d08a1a"
 
 

@@ -18,8 +18,7 @@ log = logging.getLogger(__name__)
 
 MIB = 2**20
 
-PAGES = "map-pages"
-"""Folder of the map inside a scan's folder; removed when the scan is closed."""
+PAGES = "map-pages"  # folder of the map inside a scan's folder; removed when the scan is closed
 
 
 def close_open_scans(

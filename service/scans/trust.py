@@ -17,8 +17,7 @@ from service.scans.main_piece import main_track
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
-MAX_SCALE_SIGMA = 0.05
-"""A less certain scale is not a measurement."""
+MAX_SCALE_SIGMA = 0.05  # a less certain scale is not a measurement
 
 MAX_SLOPE_DEG = 30.0
 """Above this slope, with an assumed view direction, the site was not seen from above."""
@@ -35,14 +34,12 @@ PRESSURE_SIGMA_M = 70.0
 """Of an altitude by the air pressure of the standard atmosphere, as DJI's drones without RTK state
 it: 8.4 m for each hPa of the weather, whose sigma is about 8 hPa."""
 
-MAX_NUMBER = 1e12
-"""A larger figure in a summary is none: a peer's may be anything that JSON can be."""
+MAX_NUMBER = 1e12  # a larger figure in a summary is none: a peer's may be anything that JSON can be
 
 BENDS = {"lens": 0.02, "distortion": 0.01}
 """Sigma of depth over depth by what is assumed of the lens: it bends surfaces by so much."""
 
-MIN_PLACED_SHARE = 0.5
-"""Share of the frames; below it vision was lost for most of the flight."""
+MIN_PLACED_SHARE = 0.5  # share of the frames; below it vision was lost for most of the flight
 
 REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 """Of the measured positions or attitudes, that contradict the track. Above the first, positions are
@@ -53,8 +50,7 @@ MAX_REFUTED_SHARE = 0.05
 """Of the steps of the track; where vision is refuted more often, it errs elsewhere by as much as
 attitude and positions do not show."""
 
-BY_SURVEY = "control points"
-"""``georeference`` of a scan that control points have placed."""
+BY_SURVEY = "control points"  # georeference of a scan that control points have placed
 
 FIRST_TELEMETRY = "first telemetry"
 """``scale.from`` of a scan whose segments are all too short to be fitted to telemetry."""
@@ -243,8 +239,7 @@ def slope_deg(xyz_m: Array) -> float:
     return float(np.degrees(np.arccos(min(1.0, abs(normal[2])))))
 
 
-MAX_POSES = 5000
-"""Of the track, that are asked; sigma of the position changes slowly along it."""
+MAX_POSES = 5000  # of the track, that are asked; sigma of the position changes slowly along it
 
 
 class SharedSigma:

@@ -17,8 +17,7 @@ LEAD_S = 5.0
 """Seconds of flight before the first and after the last frame, and of telemetry after it."""
 STEP_S = 0.02
 G_M_S2 = 9.81
-SWING_HZ = np.array([1.0, 0.9, 0.0])
-"""Frequencies of a swinging head about its roll and pitch axes."""
+SWING_HZ = np.array([1.0, 0.9, 0.0])  # frequencies of a swinging head about its roll and pitch axes
 
 
 def check_ranges(*rows: tuple[str, float, str, float, float]) -> None:

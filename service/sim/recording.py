@@ -32,11 +32,8 @@ FLIGHT_S, FLIGHTS = 600, 10_000
 """From the start of a flight to that of the next by its seed, and how many flights a date has."""
 ORIGIN = LocalFrame(47.3977, 8.5456, 488.0)
 DISTORTION = (-0.12, 0.03, 0.0, 0.0, 0.0)
-TERRAIN_STEPS = 6
-"""Steps to where a ray meets the terrain; hills are far flatter than the ray."""
-
-MAX_MOMENTS = 64
-"""Images at most that are averaged over an exposure."""
+TERRAIN_STEPS = 6  # steps to where a ray meets the terrain; hills are far flatter than the ray
+MAX_MOMENTS = 64  # images at most that are averaged over an exposure
 
 LARGEST_TEXELS = 120_000_000
 REPEATABLE = "bframes=0:mbtree=0:scenecut=0"

@@ -33,8 +33,7 @@ MAX_PIXELS = 1 << 22
 """Width times height of a grid; 2704x1520 fits. Decoding allocates less than 160 MB."""
 MAX_LAYER_BYTES = 1 << 24
 MAX_LAYERS = 8
-IMAGE_LAYER = MAX_LAYERS
-"""Place of a keyframe's image among its layers in the store."""
+IMAGE_LAYER = MAX_LAYERS  # place of a keyframe's image among its layers in the store
 
 _LAYER = Placed(
     b"SRKF\x01",
@@ -283,10 +282,8 @@ def _keyframe(head: LayerHead, content: planes.Planes) -> Keyframe:
     )
 
 
-IMAGE_SHARE = 0.05
-"""Bytes of a flight's images over those of its layers."""
-MAX_IMAGE_BYTES, MAX_IMAGE_PX = 1 << 16, 1024
-"""A larger image is invalid."""
+IMAGE_SHARE = 0.05  # bytes of a flight's images over those of its layers
+MAX_IMAGE_BYTES, MAX_IMAGE_PX = 1 << 16, 1024  # a larger image is invalid
 IMAGE_STEPS = ((320, 28), (320, 23), (320, 18), (256, 20), (208, 20))
 """Width in pixels and quality of JPEG, the best first: what one image leaves is for later ones."""
 

@@ -46,8 +46,7 @@ CREATE TABLE IF NOT EXISTS held (
     peer TEXT NOT NULL, kind TEXT NOT NULL, ranges TEXT NOT NULL, PRIMARY KEY (peer, kind));
 """
 
-MAX_VALUE_BYTES = 1 << 25
-"""Maximum length of a text or blob; the largest record has half of that."""
+MAX_VALUE_BYTES = 1 << 25  # maximum length of a text or blob; the largest record has half of that
 MAX_OBJECTS = 64
 STATEMENT_S = 60.0
 SLOWEST_BYTES_S = 1e6

@@ -36,16 +36,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_WAITING_EVENTS = 100_000
-CHANNEL = 256
-"""Maximum queued messages between the session and each of our threads."""
+CHANNEL = 256  # maximum queued messages between the session and each of our threads
 MAX_WAITING_ASKS = 64
-RETRY_S = 1.0
-"""Minimum interval between attempts to open a session; a tenth of it after a timeout."""
+RETRY_S = 1.0  # minimum interval between attempts to open a session; a tenth of it after a timeout
 SILENCE_S = 5.0
 """When all stations heard on a session are silent for this long, a new one is opened: TCP backs off
 before it retries a dead connection."""
-LOOK_S = 0.2
-"""Interval between two looks at a session."""
+LOOK_S = 0.2  # interval between two looks at a session
 FIRST_PATIENCE_S, MIN_PATIENCE_S = 10.0, 1.5
 PATIENCE = 3.0
 """Timeout of an attempt, as a multiple of the last one: a new session finds a recovered link sooner

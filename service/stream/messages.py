@@ -40,18 +40,15 @@ MAX_PARTS = 65_535
 MAX_COUNTED = (1 << 24) - 1
 """The highest number of a pose, re-pose or keyframe: ten a second for 19 days."""
 MAX_OPEN_RECORDS = 64
-MAX_OPEN_BYTES = 1 << 25
-"""Above either limit unfinished records are dropped, the oldest first."""
-PIECE_BYTES = 160
-"""Memory per part beyond its payload."""
+MAX_OPEN_BYTES = 1 << 25  # above either limit unfinished records are dropped, the oldest first
+PIECE_BYTES = 160  # memory per part beyond its payload
 
 KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose", 4: "image", 5: "first"} | {
     16 + k: f"k{k}" for k in range(8)
 }
 """Code of a part to the kind of its record: ``k0`` is the coarsest layer of a keyframe."""
 CODES = {name: code for code, name in KINDS.items()}
-WHOLE = ("header", "summary")
-"""Kinds of which a scan has one; a new one replaces the previous one."""
+WHOLE = ("header", "summary")  # kinds of which a scan has one; a new one replaces the previous one
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +189,7 @@ MAX_MESSAGE_BYTES = 262_144
 MAX_KINDS = 64
 MAX_RECEIVED_BYTES = 1 << 53
 
-Numbers = dict[str, RangeSet]
-"""Kind of item to the numbers of that kind."""
+Numbers = dict[str, RangeSet]  # kind of item to the numbers of that kind
 _Numbers = Annotated[Numbers, Meta(max_length=MAX_KINDS)]
 
 

@@ -9,12 +9,10 @@ from pathlib import Path
 
 from service.errors import InputError
 
-ROOT = "skyrelief"
-"""All keys are ``skyrelief/<drone>/<scan>/<topic>``."""
+ROOT = "skyrelief"  # all keys are skyrelief/<drone>/<scan>/<topic>
 
 MAX_NAME = 64
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-"""Pattern of a drone, scan or station name."""
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")  # pattern of a drone, scan or station name
 
 RUN = re.compile(r"(.+)\.([0-9a-f]{32})")
 """Name of a scan on the datalink: its own name, a dot, and its run."""

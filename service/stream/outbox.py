@@ -31,8 +31,7 @@ from service.stream.messages import (
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
 
-MAX_ASKED = 512
-"""Maximum numbers answered per request; the ground requests the rest again."""
+MAX_ASKED = 512  # maximum numbers answered per request; the ground requests the rest again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,19 +194,15 @@ def _bundle(request: Request, parts: list[Part], part_bytes: int) -> list[Outgoi
     return [Outgoing(scan_id, request.topic, p, 0, request.token, peer) for p in payloads]
 
 
-STATUS, POSE, COARSE, ASKED, FINE, BACKFILL = range(6)
-"""The lanes, most urgent first."""
+STATUS, POSE, COARSE, ASKED, FINE, BACKFILL = range(6)  # the lanes, most urgent first
 
 PEER_TIMEOUT_S = 8.0
-MAX_STATIONS = 8
-"""Maximum ground stations served; another one waits until one of them is silent."""
-MAX_ESTIMATES = 256
-"""Rates of stations that are kept across sessions."""
+MAX_STATIONS = 8  # maximum ground stations served; another one waits until one of them is silent
+MAX_ESTIMATES = 256  # rates of stations that are kept across sessions
 HEAD_AFTER_NEWS_S = 0.5
 HEAD_IDLE_S = 2.0
 HEAD_COMPLETE_S = 10.0
-FIRST_BYTES_S = 40_000.0
-"""A link that carries less than this is sent no first depths."""
+FIRST_BYTES_S = 40_000.0  # a link that carries less than this is sent no first depths
 POSE_ROOM, COARSE_ROOM, FINE_ROOM = 64, 32, 4
 """Capacity of each live lane; the last one carries image and fine layer of a keyframe."""
 

@@ -147,12 +147,10 @@ ESCAPE = 255
 _PLANE = np.array([1.0, -1.0, 0, 0, 0, 0, 0, 0, 0])
 """Weights of plane prediction, W + N - NW: the prior of the fit."""
 _PRIOR = 20.0
-FIT_PIXELS = 2_500
-"""Approximate number of known pixels in the fit."""
+FIT_PIXELS = 2_500  # approximate number of known pixels in the fit
 
 
-MARGIN = 2
-"""Margin of unknown pixels around the plane, so that every neighbour exists."""
+MARGIN = 2  # margin of unknown pixels around the plane, so that every neighbour exists
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

@@ -25,8 +25,7 @@ SIGMA_M = SIGMA_UNIT_M * 2.0 ** ((np.arange(256) - 1) / SIGMA_STEPS_PER_OCTAVE)
 SIGMA_M[0] = np.nan
 VIEWS_BLOCK_PX = 2
 MAX_VIEWS = 15
-MCU_PX = 16
-"""JPEG codes colour in blocks of this size."""
+MCU_PX = 16  # JPEG codes colour in blocks of this size
 MAX_CODE = 65535
 SPREAD = 0.03
 """A coarse pixel whose inverse depths vary by more than this share (rms) uses the middle pixel

@@ -29,14 +29,12 @@ from service.stream.records import (
 )
 from service.stream.validity import is_on_globe, is_pinhole, is_time
 
-PAYLOAD_TYPE = 42_432
-"""TUNNEL.payload_type of these messages; 32768 and above is for private use."""
+PAYLOAD_TYPE = 42_432  # TUNNEL.payload_type of these messages; 32768 and above is for private use
 MAX_BYTES = 128
 RADIO_NOTE = "from the narrow radio"
 """Note in a header that was received by radio; the drone's own header replaces it later."""
 ANNOUNCE, POSE, TILE = 0x11, 0x12, 0x13
-CELLS = 8
-"""A tile is CELLS x CELLS."""
+CELLS = 8  # a tile is CELLS x CELLS
 _DEPTH_UNIT_M = 0.02
 _LEVELS = 62  # depth codes 1 to 63; 0 is unknown
 _METRE_CM, _UNIT = 100.0, 32767  # of a quaternion

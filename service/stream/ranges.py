@@ -14,8 +14,7 @@ import numpy as np
 from service.stream.codec import IMAGE_LAYER
 from service.stream.database import Database
 
-MAX_RANGES = 4096
-"""Maximum ranges per message; the rest goes into the next message."""
+MAX_RANGES = 4096  # maximum ranges per message; the rest goes into the next message
 MAX_NUMBER = (1 << 32) - 1
 
 Pairs = list[tuple[int, int]]

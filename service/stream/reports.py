@@ -16,8 +16,7 @@ from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
-MAX_OFFERED = 20
-"""Maximum scans offered at once, the newest first."""
+MAX_OFFERED = 20  # maximum scans offered at once, the newest first
 
 
 def delivered(store: ScanStore) -> bool:
@@ -65,8 +64,7 @@ def _changed(path: Path) -> float:
         return 0.0
 
 
-TAKE_S = 0.2
-"""Interval between two evaluations of the reports."""
+TAKE_S = 0.2  # interval between two evaluations of the reports
 KEEP_S = 10.0
 """Minimum interval between two notes in a scan's store about the best supplied ground station."""
 

@@ -24,8 +24,7 @@ SEND_BUFFER_BYTES, SEND_BUFFER_S = 16_384, 0.2
 must cover a round trip, but urgent messages must not queue behind more."""
 BATCH_BYTES = 8_192
 LEASE_MS = 8_000
-MAX_MESSAGE_BYTES = 1 << 19
-"""Zenoh drops larger received messages; heads have at most half of it."""
+MAX_MESSAGE_BYTES = 1 << 19  # Zenoh drops larger received messages; heads have at most half of it
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,13 +58,9 @@ from service.stream.validity import summary_from_json
 
 _NOT_TOO_LARGE = f"LENGTH(data) <= {codec.MAX_LAYER_BYTES}"
 _IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {codec.MAX_LAYERS - 1}"
-HELD_BYTES = 500_000_000
-"""Decoded keyframes that are held."""
-
-DECODED_BYTES = 13
-"""A pixel of a keyframe: depth, sigma, views, colour, mask."""
-MAX_HELD_PEERS = 8
-"""Maximum ground stations whose items are noted."""
+HELD_BYTES = 500_000_000  # decoded keyframes that are held
+DECODED_BYTES = 13  # a pixel of a keyframe: depth, sigma, views, colour, mask
+MAX_HELD_PEERS = 8  # maximum ground stations whose items are noted
 
 
 class ScanStore:

@@ -30,14 +30,11 @@ ANNOUNCE_EVERY_S = 10.0
 POSE_EVERY_S = 1.0
 REPEATS = 2
 MAX_WAITING = 2000
-MAX_ANNOUNCED = 64
-"""Scans that the ground knows by announcement; beyond it the oldest is dropped."""
+MAX_ANNOUNCED = 64  # scans that the ground knows by announcement; beyond it the oldest is dropped
 MOVED_M, TURNED, RESCALED = 0.5, 0.01, 0.01
 """A correction beyond any of these is worth resending a keyframe's tiles."""
-LOW_BUFFER_PERCENT = 50
-"""RADIO_STATUS.txbuf below which sending slows down."""
-MAVLINK_OVERHEAD_BYTES = 17
-"""Header, checksum and TUNNEL's own fields around each payload."""
+LOW_BUFFER_PERCENT = 50  # RADIO_STATUS.txbuf below which sending slows down
+MAVLINK_OVERHEAD_BYTES = 17  # header, checksum and TUNNEL's own fields around each payload
 
 
 @dataclass(slots=True, eq=False)

@@ -17,21 +17,17 @@ from recon.types import F64
 
 MAX_POSITION_M = 1e6
 """Maximum distance from the scan's origin: the local frame is a plane and only valid nearby."""
-MAX_ALTITUDE_M = 1e5
-"""Maximum height above or below sea level or ground."""
+MAX_ALTITUDE_M = 1e5  # maximum height above or below sea level or ground
 MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 1e5
 MIN_SCALE, MAX_SCALE = 1e-3, 1e3
 """Scale of a re-pose: an assumed height of 60 m covers 6 cm to 60 km."""
-MAX_SLOPE = 57.3
-"""No pixel is further than 89 degrees off the optical axis."""
+MAX_SLOPE = 57.3  # no pixel is further than 89 degrees off the optical axis
 MAX_FOCAL_WIDTHS = 1000.0
 """Maximum focal length in image widths: a field of view of a twentieth of a degree."""
-MAX_PIXEL_RATIO = 5.0
-"""Maximum ratio of fx and fy."""
+MAX_PIXEL_RATIO = 5.0  # maximum ratio of fx and fy
 MAX_SIGMA_M = 1e6
 
-MAX_HEADER_BYTES = 262_144
-"""Maximum size of a scan header."""
+MAX_HEADER_BYTES = 262_144  # maximum size of a scan header
 MAX_SUMMARY_BYTES = 1_048_576
 MAX_NOTES = 10_000
 MAX_NAME = 128

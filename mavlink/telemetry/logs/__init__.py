@@ -99,14 +99,12 @@ class Track:
         return start_ns
 
 
-ELLIPSOID = "ellipsoid"
-"""The datum of altitudes that are not above mean sea level."""
+ELLIPSOID = "ellipsoid"  # the datum of altitudes that are not above mean sea level
 
 NEIGHBOUR_S = 10.0
 """Samples of a log follow each other that closely; one that is farther off both is damaged."""
 
-SAME_LENS = 0.02
-"""Relative tolerance of a lens that does not zoom."""
+SAME_LENS = 0.02  # relative tolerance of a lens that does not zoom
 
 
 def one_lens(values: list[float], unit: str, digits: int, warnings: list[str]) -> float | None:

@@ -39,8 +39,7 @@ from mavlink.wire.tlog import LATEST_USEC
 HEADER = b"\xa3\x95"
 UNIX_FROM_S = 1e9
 FRESH_S = 0.25
-NEAR_S = 0.05
-"""Rates of the body are known so long before and after a sample of theirs."""
+NEAR_S = 0.05  # rates of the body are known so long before and after a sample of theirs
 
 GOOD = 4  # RangeFinder status
 
@@ -98,8 +97,7 @@ def _in_time(messages: Iterable[Any]) -> Iterator[Any]:
         yield message
 
 
-TAIL_BYTES = 528
-"""What an autopilot may leave unwritten at the end of a log, by pymavlink."""
+TAIL_BYTES = 528  # what an autopilot may leave unwritten at the end of a log, by pymavlink
 
 
 @contextmanager

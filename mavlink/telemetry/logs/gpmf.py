@@ -46,8 +46,7 @@ from mavlink.telemetry.samples import (
 )
 from mavlink.wire.first_beat import CAMERA
 
-Packet = tuple[int, int, bytes]
-"""Time and duration in ns, and the bytes."""
+Packet = tuple[int, int, bytes]  # time and duration in ns, and the bytes
 
 MARK = b"DEVC"
 MAX_DEPTH, MAX_ITEMS, MAX_SAMPLES = 4, 4096, 256
@@ -66,8 +65,7 @@ COLUMNS = {
 }  # fmt: skip
 """Of a structure, those that are read; an item that declares fewer is not."""
 
-PLACES = (b"GLPI", b"GPS9", b"GPS5")
-"""Best first; the first that has one gives them all."""
+PLACES = (b"GLPI", b"GPS9", b"GPS5")  # best first; the first that has one gives them all
 
 UNKNOWN_DOP, MAX_OWN_S = 99.0, 1e10
 DRIFT_NS = 2_000_000_000

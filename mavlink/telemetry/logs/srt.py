@@ -43,8 +43,7 @@ AUTEL = re.compile(r"GPS\s*\(\s*([EW])\s*:\s*(\d+[.,]\d+)\s*,\s*([NS])\s*:\s*(\d
 FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d{0,8})(?:[.,](\d+))?(?!\d)")
 HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
 PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}\W?\s*,\s*{NUMBER}\W?\s*,\s*{NUMBER}")
-LONGEST_LINE, LONGEST_CUE = 4096, 64
-"""In letters and in lines; the rest of a cue is skipped."""
+LONGEST_LINE, LONGEST_CUE = 4096, 64  # in letters and in lines; the rest of a cue is skipped
 
 RESTART_NS = 1_000_000_000
 """A time that goes back to this long after the start, at most, begins again: joined files."""

@@ -20,8 +20,7 @@ HEARTBEAT = 0
 WANTED = numbers_of(READERS)
 
 
-Key = tuple[int, int, int]
-"""System, component, boot session."""
+Key = tuple[int, int, int]  # system, component, boot session
 
 Streams = dict[Key, list[tuple[int, float | None, Sample]]]
 """Stamp in ns, unwrapped boot time in ms, and sample."""

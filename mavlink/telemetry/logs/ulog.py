@@ -44,8 +44,7 @@ BROKEN = (
 )
 """Errors that pyulog raises on damaged logs."""
 
-Columns = dict[str, Any]
-"""Field name to array (N,)."""
+Columns = dict[str, Any]  # field name to array (N,)
 
 Row = Callable[[str], float]
 """The value of a declared field; NaN where the log does not declare it."""
@@ -54,8 +53,7 @@ PLACES = ("vehicle_global_position", "vehicle_local_position", "vehicle_gps_posi
 """Topics with a position, best first; a later one gives them before and after those of a better
 one: an estimate may begin long after the receiver's fixes, or end."""
 
-NEAR_US = 250_000
-"""Velocities are known so long before and after a sample of theirs."""
+NEAR_US = 250_000  # velocities are known so long before and after a sample of theirs
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
