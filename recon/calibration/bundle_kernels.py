@@ -14,11 +14,8 @@ from numba import njit
 from recon.small_matrices import invert_3x3
 from recon.types import F64, I64
 
-CAMERA = 8
-"""Number of the camera's unknowns; k3 stays."""
-
-POINT_STEPS = 2
-"""Of each point alone after a step of all."""
+CAMERA = 8  # number of the camera's unknowns; k3 stays
+POINT_STEPS = 2  # of each point alone after a step of all
 
 
 @njit(cache=True, nogil=True)

@@ -193,10 +193,8 @@ def _accumulate(
     keys: I64, ids: I32, sums: Rows, count: int, number: int, xyz: F32, rgb: U8, sigma: F32,
     views: U8, inverse: float, low: float, high: float,
 ) -> int:  # fmt: skip
-    """Add the points in [low, high) of the x index to the sums; the new number of voxels.
-
-    Points without a sigma are left out.
-    """
+    """Add the points in [low, high) of the x index to the sums; the new number of voxels. Points
+    without a sigma are left out."""
     for n in range(xyz.shape[0]):
         s = sigma[n]
         if not (s > 0.0 and s < 1e6):
@@ -240,10 +238,8 @@ def _accumulate(
 def _lone_contradicted(
     begin: int, end: int, keys: I64, xyz: F32, sigma: F32, views: U8, out: Bool
 ) -> None:
-    """Mark lone single-view points with better, more often seen surface above or below.
-
-    ``keys`` are sorted, so a column of voxels is one run of rows.
-    """
+    """Mark lone single-view points with better, more often seen surface above or below. ``keys``
+    are sorted, so a column of voxels is one run of rows."""
     n = keys.shape[0]
     low = (1 << 21) - 1
     for p in range(begin, end):
@@ -266,8 +262,7 @@ def _lone_contradicted(
         out[p] = contradicted and neighbours < LONE_NEIGHBOURS
 
 
-BITS = 21
-"""Of the number of a cell along each axis in its key, x first."""
+BITS = 21  # of the number of a cell along each axis in its key, x first
 
 
 def pieces(cells: I64) -> I64:
@@ -314,9 +309,7 @@ def cloud_of(
     depth: DepthMap, bgr: U8, mask: Bool | None = None, time_ns: int | None = None
 ) -> PointCloud:
     """World points of the pixels with a resolved depth, in row order, where ``mask`` if given.
-
-    ``bgr`` is (h, w, 3) on the grid of the depth.
-    """
+    ``bgr`` is (h, w, 3) on the grid of the depth."""
     known = np.isfinite(depth.depth_m) & (depth.depth_m > 0.0) & np.isfinite(depth.sigma_m)
     resolved = known & (depth.sigma_m < MAX_SIGMA_SHARE * depth.depth_m)
     known = resolved & (2 * resolved.sum() >= known.sum())

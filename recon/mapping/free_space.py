@@ -21,14 +21,9 @@ from recon.types import F32, F64, I16, I64, U8, Array, Bool, DepthMap, PointClou
 
 U32 = npt.NDArray[np.uint32]
 
-PLACES = 2048
-"""Points in a tile, about."""
-
-SAMPLED = 100_000
-"""Number of places that the size of a tile is estimated from."""
-
-HALF = 1 << 15
-"""Rows and columns of tiles to either side; farther points share the last ones."""
+PLACES = 2048  # points in a tile, about
+SAMPLED = 100_000  # number of places that the size of a tile is estimated from
+HALF = 1 << 15  # rows and columns of tiles to either side; farther points share the last ones
 
 
 class Tiles:
@@ -62,9 +57,8 @@ class Tiles:
     def in_view(
         self, depth: DepthMap, slack_m: float = 0.0, up_m: tuple[float, float] = (0.0, 0.0)
     ) -> I64:
-        """(M,) undecided tiles that may hold a place in the image, no more than ``slack_m``
-        behind the farthest surface in it; or one that is raised by ``up_m``, from and to.
-        """
+        """(M,) undecided tiles that may hold a place in the image, no more than ``slack_m`` behind
+        the farthest surface in it; or one that is raised by ``up_m``, from and to."""
         planes = _planes(depth, slack_m)
         if planes is None:
             return np.zeros(0, np.int64)
@@ -127,8 +121,7 @@ def _planes(depth: DepthMap, slack_m: float) -> F64 | None:
 
 AGREES_SIGMAS = 2.5
 BEHIND_SIGMAS = 4.0
-WINDOW_PX = 2
-"""Surface must be behind the point at every known pixel this far around it."""
+WINDOW_PX = 2  # surface must be behind the point at every known pixel this far around it
 
 KNOWN_SHARE = 0.5
 
@@ -136,18 +129,15 @@ MAX_VIEWS = 100
 """Maximum number of keyframes consulted per point: a camera that stays over one place has
 thousands. Their pairs, at most 255 each, are counted in 16 bits."""
 
-AIR_SLACK_M = 1.0
-"""Air that a surface of the whole image hides is looked at so far behind it."""
+AIR_SLACK_M = 1.0  # air that a surface of the whole image hides is looked at so far behind it
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 T = TypeVar("T")
 
 
 def spread(views: Sequence[T]) -> list[T]:
-    """The same views in an order whose every beginning is spread evenly over the whole.
-
-    By the golden ratio: Weyl's sequence of low discrepancy.
-    """
+    """The same views in an order whose every beginning is spread evenly over the whole. By the
+    golden ratio: Weyl's sequence of low discrepancy."""
     turns = (np.arange(len(views)) * GOLDEN) % 1.0
     return [views[i] for i in np.argsort(turns, kind="stable").argsort(kind="stable")]
 
@@ -197,10 +187,8 @@ def air_above(
 
 @njit(cache=True, nogil=True)
 def pixel_of(K: F64, T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The pixel (u, v) of a place and its depth; (-1, -1) nearer than 0.1 m or behind.
-
-    ``T`` is T_camera_world, at least its first three rows.
-    """
+    """The pixel (u, v) of a place and its depth; (-1, -1) nearer than 0.1 m or behind. ``T`` is
+    T_camera_world, at least its first three rows."""
     cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
     if cz <= 0.1:
         return -1.0, -1.0, cz
@@ -242,10 +230,8 @@ def _vote(
     begin: int, end: int, tiles: I64, first: I64, xyz: F32, is_decided: Bool, depth: F32,
     depth_sigma: F32, K: F64, T: F64, sigma: F32, views: U8, seers: I16, asked: U8,
 ) -> None:  # fmt: skip
-    """Add one keyframe's votes on the points of ``tiles[begin:end]`` to ``seers``.
-
-    A vote is the pairs that see less the pairs that see through; ``T`` is T_camera_world.
-    """
+    """Add one keyframe's votes on the points of ``tiles[begin:end]`` to ``seers``. A vote is the
+    pairs that see less the pairs that see through; ``T`` is T_camera_world."""
     h, w = depth.shape
     for tile in tiles[begin:end]:
         left = 0

@@ -57,10 +57,8 @@ def _gappy_fit(inverse: Any, v: int, u: int, fit: Any) -> bool:
 
 @njit(cache=True, nogil=True)
 def _full_fits(inverse: Any, v: int, column: Any, fits: Any) -> None:
-    """Fill ``fits`` (4, w) of row ``v``: value, slopes, mean square residual; NaN near holes.
-
-    A hole is NaN and spoils every sum that it is part of, so no pixel needs to be asked.
-    """
+    """Fill ``fits`` (4, w) of row ``v``: value, slopes, mean square residual; NaN near holes. A
+    hole is NaN and spoils every sum that it is part of, so no pixel needs to be asked."""
     h, w = inverse.shape
     fits[:] = np.nan
     if v < REACH or v >= h - REACH:

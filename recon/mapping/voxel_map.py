@@ -18,17 +18,14 @@ from recon.table import Rows
 from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
 EMPTY = np.int64(-1)
-TILE_BITS = 7
-"""Pages hold square columns of 2**7 voxels on a side."""
-SAMPLED_ROWS = 24
-"""Of a depth map, where some of its surface stands for all."""
+TILE_BITS = 7  # pages hold square columns of 2**7 voxels on a side
+SAMPLED_ROWS = 24  # of a depth map, where some of its surface stands for all
 _OFFSET = 1 << 20
 LARGEST_INDEX = _OFFSET - 1
 """Voxel indices reach this far from the origin on each axis; points beyond are left out."""
 
 
-BETTER_RATIO = 1.5
-"""Surface is better when its sigma, times this, is still below the held one."""
+BETTER_RATIO = 1.5  # surface is better when its sigma, times this, is still below the held one
 
 REACH_SIGMA, LARGEST_REACH = 2.0, 6
 """Held surface within so many sigma along the pixel's ray is the same surface, so many voxels away
@@ -75,8 +72,7 @@ def rehash(old: I64, ids: I32, size: int) -> tuple[I64, I32]:
 VOXEL = np.dtype([("sigma_m", np.float32), ("seen", np.int32)])
 """What is held of a voxel: its sigma, and the turn of the last keyframe that saw it."""
 
-PAGED = np.dtype([("key", np.int64), *VOXEL.descr])
-"""A voxel outside a map, as it is paged."""
+PAGED = np.dtype([("key", np.int64), *VOXEL.descr])  # a voxel outside a map, as it is paged
 
 
 def tile_of(keys: I64) -> I64:

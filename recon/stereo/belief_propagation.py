@@ -49,8 +49,7 @@ from recon.types import F32, I16, U8, DisparityMap
 SPECKLE_STEP = 16
 """Sixteenths of a label: neighbours further apart than one label belong to two surfaces."""
 
-UNKNOWN = -32768
-"""Where there is no label; none within 1024 comes near it."""
+UNKNOWN = -32768  # where there is no label; none within 1024 comes near it
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +106,8 @@ def belief_propagation(
 def drop_unreliable(
     left: U8, px: F32, confidence: F32, config: BeliefPropagationConfig
 ) -> DisparityMap:
-    """Return the labels that pass the checks of contrast, visibility and surface size.
-
-    ``px`` and ``confidence`` are changed in place. Every backend ends with this.
-    """
+    """Return the labels that pass the checks of contrast, visibility and surface size. ``px`` and
+    ``confidence`` are changed in place. Every backend ends with this."""
     if config.min_contrast > 0:
         confidence[local_variance(left, 9) < config.min_contrast**2] = 0
     if config.occlusion_tolerance >= 0:
@@ -145,23 +142,12 @@ def _forget(coarse: Any, px: Any, confidence: Any) -> None:
             confidence[v, u] = confidence[v, u] if known else np.float32(0)
 
 
-RADIUS = 3
-"""Radius of the window whose summed cost places the minimum between labels."""
-
-PAD = 2
-"""Cells beyond a row of cells that the window reaches."""
-
-SURE_EVIDENCE = 0.6
-"""Evidence of a well textured match; confidence grows up to it."""
-
-FILLED_CONFIDENCE = 0.05
-"""Confidence of a pixel that only its neighbours speak for."""
-
-FAR = 16384
-"""Above any belief."""
-
-NOISE = 0.2 * COST_UNIT
-"""Mean cost below which a window is taken for plain."""
+RADIUS = 3  # radius of the window whose summed cost places the minimum between labels
+PAD = 2  # cells beyond a row of cells that the window reaches
+SURE_EVIDENCE = 0.6  # evidence of a well textured match; confidence grows up to it
+FILLED_CONFIDENCE = 0.05  # confidence of a pixel that only its neighbours speak for
+FAR = 16384  # above any belief
+NOISE = 0.2 * COST_UNIT  # mean cost below which a window is taken for plain
 
 
 def _labels(
@@ -223,9 +209,7 @@ def _slide(new: Any, old: Any, sums: Any) -> None:
 @njit(cache=True, nogil=True)
 def _window(sums: Any, out: Any) -> None:
     """Sums over columns, of both parities (2, cells), from those over rows (2, PAD + cells + PAD).
-
-    Of seven columns three are of the one parity and four of the other.
-    """
+    Of seven columns three are of the one parity and four of the other."""
     cells = out.shape[1]
     even, odd = sums[0], sums[1]
     a, b, c, d = even[1:][:cells], even[2:][:cells], even[3:][:cells], even[4:][:cells]

@@ -23,8 +23,7 @@ CLOSED_PX = 5
 """Gaps in what is dropped are closed by a square of this side: halfway between the two surfaces
 the plane through the mixture fits."""
 
-FILL_PX = 15
-"""Unknown pixels take the mean of the known ones in a window of this side."""
+FILL_PX = 15  # unknown pixels take the mean of the known ones in a window of this side
 
 STEP_SIGMAS = 6.0
 """A pixel that lies farther than the surface of another by more of both sigmas is behind it: about

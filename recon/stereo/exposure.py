@@ -19,21 +19,16 @@ from recon.small_matrices import solve_symmetric
 from recon.stereo.matching_cost import BORDER, census_row, columns_apart, plain, popcount
 from recon.types import U8
 
-SAMPLES = 2400
-"""About so many pixels, in a grid, are matched."""
+SAMPLES = 2400  # about so many pixels, in a grid, are matched
 
 MAX_BITS, MARGIN = 4, 4
 """A clear match: at most so many bits of census differ, and so many more at any other label."""
 
-TERMS = 8
-"""1, g, g^2, g x, g y, g x^2, g x y, g y^2 of the gray level and the place, -1 to 1."""
-
-PRIOR = 0.1
-"""Weight of no change, in samples."""
+TERMS = 8  # 1, g, g^2, g x, g y, g x^2, g x y, g y^2 of the gray level and the place, -1 to 1
+PRIOR = 0.1  # weight of no change, in samples
 
 STEPS = 4
-MIN_SAMPLES, FITTED = 64, 500
-"""Clear matches that are needed, and at most used."""
+MIN_SAMPLES, FITTED = 64, 500  # clear matches that are needed, and at most used
 
 
 def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:

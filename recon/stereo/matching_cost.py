@@ -24,8 +24,7 @@ from recon.parallel import parallel_for
 from recon.stereo.lanes import LANES, Lanes, cells_of
 from recon.types import I16, U8
 
-COST_UNIT = 100
-"""Integer cost of a disparity step of one label between neighbours."""
+COST_UNIT = 100  # integer cost of a disparity step of one label between neighbours
 
 _NEAR = [(dv, du) for dv in range(-2, 3) for du in range(-2, 3) if dv or du]
 _FAR = [(-3, -1), (-3, 1), (-1, -3), (-1, 3), (1, -3), (1, 3), (3, -1), (3, 1)]
@@ -33,17 +32,10 @@ CENSUS_OFFSETS = tuple(_NEAR + _FAR)
 """Row and column of the neighbours that a pixel is compared with: 5x5, and eight on a ring around
 them, which tell weak texture from noise. They fill one 32-bit word."""
 
-MAX_COST = 254
-"""One byte holds it; 255 is that of a label that is not seen."""
-
-CENSUS_REACH = 3
-"""The farthest row or column of a neighbour."""
-
-BORDER = 4
-"""Columns before the first one, an even number not below the reach."""
-
-MAX_SPARE = 8
-"""Memory this many times larger than requested is released."""
+MAX_COST = 254  # one byte holds it; 255 is that of a label that is not seen
+CENSUS_REACH = 3  # the farthest row or column of a neighbour
+BORDER = 4  # columns before the first one, an even number not below the reach
+MAX_SPARE = 8  # memory this many times larger than requested is released
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +101,8 @@ def matching_cost(
 
 
 def plain(array: Any) -> Any:
-    """The array, or a copy: in C order and writeable, as the kernels are compiled for.
-
-    Any other kind would be compiled in flight, which takes seconds.
-    """
+    """The array, or a copy: in C order and writeable, as the kernels are compiled for. Any other
+    kind would be compiled in flight, which takes seconds."""
     return np.require(array, requirements=["C", "W"])
 
 

@@ -123,8 +123,7 @@ def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
 WEIGHT_BITS = np.int32(8)
 FULL_WEIGHT = 256
 
-UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
-"""Where a message travels."""
+UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3  # where a message travels
 
 WORKSPACE = Workspace()
 
@@ -178,9 +177,7 @@ def _coarser_weights(fine: Any) -> Any:
 
 def edges_of(weights: I16, smoothness: Smoothness) -> I16:
     """Slope and truncation of each edge: (slope or cut, vertical or horizontal, row, parity, cell).
-
-    A row and a cell beyond the border are never read for a pixel that exists.
-    """
+    A row and a cell beyond the border are never read for a pixel that exists."""
     cells = cells_of(weights.shape[2])
     return np.asarray(_edges(weights, cells, smoothness.slope, smoothness.truncation))
 
@@ -319,10 +316,8 @@ def _interleave_code(context: Any, builder: Any, signature: Any, args: Any) -> A
 
 @njit(cache=True, nogil=True)
 def _start_row(coarse: Any, v: int, height: int, width: int, ring: Any) -> None:
-    """The messages that row ``v`` starts from: those of the coarser cells that it divides.
-
-    Only the colour that the first sweep reads is filled; the sweep writes the other.
-    """
+    """The messages that row ``v`` starts from: those of the coarser cells that it divides. Only the
+    colour that the first sweep reads is filled; the sweep writes the other."""
     _, rows, _, labels, cells = ring.shape
     row = ring[:, (v + 1) % rows]
     if v > height:

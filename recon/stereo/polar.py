@@ -27,14 +27,12 @@ from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
 SEAM_GAP_RAD = 0.3
 """A gap between the directions of the pixels that is wider is no part of the image."""
 
-OUTSIDE_PX = 1e4
-"""Further out than any image."""
+OUTSIDE_PX = 1e4  # further out than any image
 
 MIN_DETAIL = 1.5
 """Gray levels of standard deviation in 5x5 pixels: less is sky, water or plain paint."""
 
-SAMPLES = (64, 36)
-"""Pixels across and down that stand for an image when its sector is measured."""
+SAMPLES = (64, 36)  # pixels across and down that stand for an image when its sector is measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,10 +120,8 @@ def masked_rad(distance: float, baseline: float, px_per_rad: float, share: float
 
 
 def sampling(rays: F64, px_per_rad: float, masked: float) -> Sampling | None:
-    """The sector that ``rays`` (N, 3) of an image in polar axes fill; None when all is masked.
-
-    At the rim of the sector rows lie as far apart as columns do.
-    """
+    """The sector that ``rays`` (N, 3) of an image in polar axes fill; None when all is masked. At
+    the rim of the sector rows lie as far apart as columns do."""
     away, about = polar_angles(rays)
     good = (away > masked) & (away < np.pi - masked)
     if good.sum() < 8:
@@ -160,10 +156,8 @@ def relief_of(
 def label_window(
     points: F64, plane: F64, baseline: float, px_per_rad: float, relief: tuple[float, float]
 ) -> tuple[float, float]:
-    """Lowest and highest shift from the plane, columns, of ``points`` (N, 3) in polar axes.
-
-    Half of the plane below ``points`` keeps in it when raised or lowered to ``relief``.
-    """
+    """Lowest and highest shift from the plane, columns, of ``points`` (N, 3) in polar axes. Half of
+    the plane below ``points`` keeps in it when raised or lowered to ``relief``."""
 
     def shift(P: F64) -> F64:
         away, about = polar_angles(P)

@@ -18,8 +18,7 @@ LABEL_SIGMA_PX = 0.075
 """Usual sigma of a label of full confidence, in pixels of the grid that was matched;
 :func:`label_noise` measures what it is."""
 
-MIN_CONFIDENCE = 0.05
-"""A label with a lower confidence is not used."""
+MIN_CONFIDENCE = 0.05  # a label with a lower confidence is not used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,8 +116,7 @@ def _reproject(
             sigma_m[v, u] = depth / d * abs(slope) * sigma_px / np.sqrt(trust)
 
 
-AGREES_SIGMAS = 3.0
-"""Neighbours within so many sigmas of a pixel lie on its surface."""
+AGREES_SIGMAS = 3.0  # neighbours within so many sigmas of a pixel lie on its surface
 
 
 def carry(pair: PairDepth, K: F64, T_here_there: F64) -> PairDepth:
@@ -208,8 +206,7 @@ PAIRS_CORRELATION = 0.15
 """Correlation of the errors of two pairs of a view: they share its image. Measured on simulated
 flights at crf 18 and 32 (docs/reports/simulated-flights.md)."""
 
-MAX_NOISE = 8.0
-"""Noise of labels over the usual one, at most: with more, nothing matches."""
+MAX_NOISE = 8.0  # noise of labels over the usual one, at most: with more, nothing matches
 
 
 def label_noise(pairs: Sequence[PairDepth]) -> float | None:
@@ -359,8 +356,7 @@ def _fuse(
 
 TILT_SIGMAS = 2.0
 
-MAX_STEP_SHARE = 0.1
-"""Neighbouring pixels whose depths differ by more belong to two surfaces."""
+MAX_STEP_SHARE = 0.1  # neighbouring pixels whose depths differ by more belong to two surfaces
 
 STRIP_SHARE = 0.2
 """Of the image below the horizon; less of it without any depth shows no ground: the pairs' other

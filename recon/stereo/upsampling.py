@@ -18,14 +18,12 @@ from recon.parallel import parallel_for
 from recon.stereo.matching_cost import plain
 from recon.types import F32, I32, U8, DisparityMap
 
-PAPER_RATIO = 2704 / 320
-"""Fine pixels per coarse pixel in the paper."""
+PAPER_RATIO = 2704 / 320  # fine pixels per coarse pixel in the paper
 
 RANGE_FLOOR = -20.0
 """log2 of the least range weight, so that a pixel like none of its taps takes their mean."""
 
-MIN_CONFIDENCE = 1e-3
-"""The least weight of a known tap."""
+MIN_CONFIDENCE = 1e-3  # the least weight of a known tap
 
 FARTHEST = -40.0
 OUTSIDE = -60.0
@@ -174,10 +172,8 @@ def _exp2(e: Any) -> Any:
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
 def _add_taps(tap: Any, near: Any, spatial: Any, colours: Any, totals: Any) -> None:
-    """Add GROUP neighbouring taps of one coarse row to the sums of some runs of fine pixels.
-
-    Flat arrays and constant offsets, so that the compiler sees that nothing overlaps.
-    """
+    """Add GROUP neighbouring taps of one coarse row to the sums of some runs of fine pixels. Flat
+    arrays and constant offsets, so that the compiler sees that nothing overlaps."""
     for row in range(spatial.shape[0]):
         s = spatial[row]
         colour = colours[row]

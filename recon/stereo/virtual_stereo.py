@@ -38,17 +38,14 @@ BLURRED, UNLIKE = 0.016, 0.012
 the difference of their squares (1/px): measured on a textured plane
 (docs/reports/rolling-shutter.md)."""
 
-CELL = 8
-"""Pixels between two places where the warp of a rolling shutter is computed."""
+CELL = 8  # pixels between two places where the warp of a rolling shutter is computed
 
 
 def check_pair(
     left: PosedImage, right: PosedImage, depth_m: float, config: VirtualStereoConfig
 ) -> str | None:
-    """The reason why the views make no stereo pair, or None when they do.
-
-    ``depth_m`` is the median distance of what the left view sees.
-    """
+    """The reason why the views make no stereo pair, or None when they do. ``depth_m`` is the median
+    distance of what the left view sees."""
     T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
     t = T_left_right[:3, 3]
     base = float(np.linalg.norm(t))
@@ -317,10 +314,8 @@ def _fit_plane(u: F64, v: F64, d: F64) -> tuple[F64, F64]:
 def homography(
     view: PosedImage, R_rect_view: F64, K: F64, oversample: float, plane: F64 | None
 ) -> F64:
-    """(3, 3) from a pixel of the rectified image (``oversample`` finer) to one of the view.
-
-    The shift by the disparity plane is affine along the rows, so it is part of it.
-    """
+    """(3, 3) from a pixel of the rectified image (``oversample`` finer) to one of the view. The
+    shift by the disparity plane is affine along the rows, so it is part of it."""
     fine = scaled_K(np.eye(3), 1 / oversample, 1 / oversample)
     shift = np.eye(3)
     if plane is not None:
@@ -352,9 +347,7 @@ def _sampled(
     image: U8, view: PosedImage, M: F64, size: tuple[int, int], flags: int, border: int
 ) -> U8:
     """The view's ``image``, at any scale, of ``size`` (w, h) by ``M`` (3, 3) to the view's pixels.
-
-    A rolling shutter's rows are brought to the middle row's time in the same step.
-    """
+    A rolling shutter's rows are brought to the middle row's time in the same step."""
     H, W = view.gray.shape
     sx, sy = image.shape[1] / W, image.shape[0] / H
     if view.rows is None:
@@ -370,9 +363,7 @@ def _sampled(
 
 def _row_field(view: PosedImage, M: F64, size: tuple[int, int]) -> F32:
     """(h, w, 2) pixels of the view's image that show what ``M`` (3, 3) leads to at its middle row.
-
-    Computed on a grid of CELL pixels and interpolated: the field is smooth.
-    """
+    Computed on a grid of CELL pixels and interpolated: the field is smooth."""
     assert view.rows is not None and view.scene is not None
     w, h = size
     cols, rows = -(-w // CELL) + 2, -(-h // CELL) + 2
@@ -417,9 +408,7 @@ def _still(view: PosedImage) -> PosedImage:
 
 def plane_relief(depth: DepthMap, known: tuple[float, float]) -> tuple[float, float]:
     """Lowest and highest surface in metres towards the camera from the main plane of a view.
-
-    ``known`` is what earlier views showed; it fades by a tenth per view.
-    """
+    ``known`` is what earlier views showed; it fades by a tenth per view."""
     h, w = depth.depth_m.shape
     step = max(1, h // 60)
     z = depth.depth_m[::step, ::step].astype(np.float64)

@@ -24,9 +24,7 @@ from recon.types import F32, F64, U8, Bool
 @njit(cache=True, nogil=True, fastmath=True)
 def affine_trend(uv: Any, moves: Any, first: Any, tolerance: float, trend: Any) -> None:
     """Fill ``trend`` (3, 2): ``moves`` (N, 2) as 1, u / 1000, v / 1000 times it, robustly.
-
-    Reweighted from ``first`` (2,) with a tolerance that narrows from eightfold to itself.
-    """
+    Reweighted from ``first`` (2,) with a tolerance that narrows from eightfold to itself."""
     trend[:] = 0.0
     trend[0, 0], trend[0, 1] = first[0], first[1]
     row = np.empty(3)
@@ -98,10 +96,8 @@ def harris_cells(
     begin: int, end: int, image: Any, mask: Any, columns: int, rows: int, margin: int, k: float,
     found: Any,
 ) -> None:  # fmt: skip
-    """Fill ``found`` (rows, columns, 3) with u, v and R of each cell's best local maximum.
-
-    R is zero where the cell has none. ``mask`` is (H, W) uint8 or (0, 0) for none.
-    """
+    """Fill ``found`` (rows, columns, 3) with u, v and R of each cell's best local maximum. R is
+    zero where the cell has none. ``mask`` is (H, W) uint8 or (0, 0) for none."""
     H, W = image.shape
     masked = mask.shape[0] == H
     kk = np.float32(k)
@@ -135,15 +131,13 @@ def harris_cells(
                 found[j, i, 0], found[j, i, 1], found[j, i, 2] = bx, y0 + by - 1, best
 
 
-HARRIS_K = 0.04
-"""k of Eq. 5, as usual since Harris and Stephens 1988 (0.04 to 0.06)."""
+HARRIS_K = 0.04  # k of Eq. 5, as usual since Harris and Stephens 1988 (0.04 to 0.06)
 
 MIN_RESPONSE, MIN_CONTRAST = 4.0, 2.0
 """R of Eq. 5, gray levels to the fourth, and standard deviation of a patch, gray levels, at least:
 noise alone reaches no more."""
 
-PATCH_RADIUS_PX = 5
-"""A patch is 11 x 11 px."""
+PATCH_RADIUS_PX = 5  # a patch is 11 x 11 px
 
 LEVELS, COARSE_REACH_PX = 5, 8
 """Levels of a pyramid, and the search radius in pixels of the level that a search begins at, both
@@ -152,8 +146,7 @@ at most."""
 REFINE_ITERATIONS = 6
 """Gauss-Newton steps to the sub-pixel place, at most; a step below 0.02 px ends it."""
 
-FAR = 1e6
-"""px; stands for a prediction that is not a number."""
+FAR = 1e6  # px; stands for a prediction that is not a number
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,9 +189,7 @@ def _check_gray(gray: U8) -> None:
 
 def harris_grid(gray: U8, config: MatchingConfig = DEFAULT, mask: U8 | None = None) -> F32:
     """(N, 3) u, v and R of the strongest Harris corner in each cell of ``gray`` (H, W), Eq. 4-5.
-
-    ``mask`` (H, W) is zero where the image holds nothing; patches stay clear of it.
-    """
+    ``mask`` (H, W) is zero where the image holds nothing; patches stay clear of it."""
     _check_gray(gray)
     margin = PATCH_RADIUS_PX + 3
     allowed = np.zeros((0, 0), np.uint8)
@@ -339,11 +330,8 @@ def match(
     return Matches(uv.astype(np.float32), zssd.astype(np.float32), ok)
 
 
-LEADERS = 48
-"""Points that show the error of all predictions."""
-
-STEADY_PX = 1.0
-"""Their errors differ by about this from an affine motion, at most."""
+LEADERS = 48  # points that show the error of all predictions
+STEADY_PX = 1.0  # their errors differ by about this from an affine motion, at most
 
 
 def match_led(
@@ -402,9 +390,7 @@ def _follow_others(
     stray_px: float,
 ) -> tuple[F64, Bool]:  # fmt: skip
     """Places, and which of them take part, after points without an answer got one from the trend.
-
-    So did those further than ``stray_px`` from it: relief moves points, but not that far.
-    """
+    So did those further than ``stray_px`` from it: relief moves points, but not that far."""
     trend = _consensus(a, uv - predicted, active, tolerance_px)
     if trend is None:
         return uv, active

@@ -24,24 +24,16 @@ THRESHOLD_PX = 2.0
 """Largest reprojection error of an inlier: a corner errs by some tenths, and a
 landmark by as much as the views that gave it."""
 
-MIN_INLIERS, MIN_INLIER_SHARE = 15, 0.3
-"""Inliers of a pose, and their share of the points given, at least."""
+MIN_INLIERS, MIN_INLIER_SHARE = 15, 0.3  # of a pose, at least, and of the points given
 
 DRAWS, CONFIDENCE = 200, 0.9999
 """RANSAC's draws, at most, and the chance of a clean draw at which it stops early. Where half of
 the points are wrong, one draw of five points in 32 is clean: 200 draws hold one at 99.8 %."""
 
-MAX_SIGMA_SHARE = 0.03
-"""Sigma of the position over the median depth, at most: as much as the shortest baseline."""
-
-FLOOR_PX = 0.1
-"""Least error assumed of a match, 1 sigma."""
-
-PRIOR_SHARE = 0.7
-"""Of the points near the prior's pixels, from which on there is no random draw."""
-
-MAX_PRIOR_TURN_RAD, MOST = 0.35, 0.6
-"""A pose that far from the prior needs that share of the points."""
+MAX_SIGMA_SHARE = 0.03  # of the position over the median depth: as much as the shortest baseline
+FLOOR_PX = 0.1  # least error assumed of a match, 1 sigma
+PRIOR_SHARE = 0.7  # of the points near the prior's pixels, from which on there is no random draw
+MAX_PRIOR_TURN_RAD, MOST = 0.35, 0.6  # a pose that far from the prior needs so many of the points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,8 +51,7 @@ class PnpResult:
         return float(np.mean(self.inliers))
 
 
-STEPS = 10
-"""Maximum number of Gauss-Newton steps."""
+STEPS = 10  # maximum number of Gauss-Newton steps
 
 
 def solve(

@@ -13,8 +13,7 @@ from recon.tracking import robust_geometry, two_view
 from recon.tracking.frame import Frame
 from recon.types import F64, I64, Bool, PosePrior
 
-MIN_MEASURED = 12
-"""Landmarks that give a scale."""
+MIN_MEASURED = 12  # landmarks that give a scale
 
 
 def inverse_depth_plane(P: F64) -> F64:
@@ -163,8 +162,7 @@ def fresh_corners(corners: F64, kept: F64, size_px: tuple[int, int], grid: int) 
     return np.asarray(corners[~taken[cell[:, 1], cell[:, 0]]])
 
 
-STEADY_S = 0.3
-"""Velocities of frames closer than this are averaged with those before."""
+STEADY_S = 0.3  # velocities of frames closer than this are averaged with those before
 
 
 class ConstantVelocity:
@@ -177,7 +175,6 @@ class ConstantVelocity:
         self._turn_rad_s = 0.0
 
     def update(self, time_ns: int, T_odom_camera: F64, prior: PosePrior) -> None:
-        """Take in the next frame's pose (4, 4)."""
         last_ns, T_last, _ = self._last
         if time_ns > last_ns:
             dt = (time_ns - last_ns) * 1e-9
