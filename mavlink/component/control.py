@@ -41,7 +41,8 @@ class Work:
 
     def __init__(self, is_brief: bool = False) -> None:
         self._lock = threading.Lock()
-        self.is_brief = is_brief  # usually done within half a second: no progress until then
+        # Usually done within half a second: no progress until then, and nothing to cancel.
+        self.is_brief = is_brief
         self.fraction = 0.0  # progress, 0 to 1
         self.answer: Handled | None = None  # the result, or the work that follows; None: it runs
         self.cancelled = False
@@ -55,7 +56,7 @@ class Work:
             self.answer = self.answer or answer
 
     def cancel(self) -> None:
-        self.cancelled = True
+        self.cancelled = not self.is_brief
 
 
 Handled = Answer | Work

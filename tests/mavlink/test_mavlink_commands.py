@@ -686,6 +686,14 @@ def test_work_can_be_cancelled(ends: Ends) -> None:
     assert [m.result for m in acks] == [CANCELLED]
 
 
+def test_a_stop_that_takes_effect_cannot_be_cancelled(ends: Ends) -> None:
+    work = ends.control.works["stop_scan"] = Work(is_brief=True)
+    ends.command(2501, 100)
+    ends.say_bytes(cancel_message(2501))
+    work.finish()
+    assert results(ends.pass_time(0.1), 2501) == [ACCEPTED]
+
+
 def test_work_without_end_fails(ends: Ends) -> None:
     work = ends.control.works["finalise"] = Work()
     ends.command(31010, 191, 5)
