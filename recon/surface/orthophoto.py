@@ -1,9 +1,10 @@
 """True orthophoto: each place of a surface model from the view that looks at it most steeply.
 
-Views that a higher part of the surface hides, or nearly, are left out, and so are those whose
-colour differs from most others (:func:`recon.surface.texture_views.drop_outliers`). The views'
-exposures are levelled, and neighbouring views blend across one cell of the surface model. An object
-is shown by one view as far as that sees it, so that seams run around buildings.
+Views that a higher part of the surface hides, or nearly, are left out. The views' exposures are
+levelled, as a whole and from part to part of an image, and then those whose colour differs from
+most others left out (:func:`recon.surface.texture_views.consistent`). Neighbouring views blend
+across one cell of the surface model. An object is shown by one view as far as that sees it, so that
+seams run around buildings.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from recon.mapping.free_space import pixel_of
 from recon.parallel import parallel_for
 from recon.surface.raster import Grid, Raster, highest_lowest
 from recon.surface.texture_atlas import Images, add_view, images_of, sample
-from recon.surface.texture_views import TextureView, TriangleViews, drop_outliers, insert
-from recon.surface.texturing import levels
+from recon.surface.texture_views import TextureView, TriangleViews, consistent, insert
+from recon.surface.texturing import faded_steps, levels
 from recon.types import F32, F64, I32, U8, Bool
 
 CLEAR_M = 0.3
@@ -67,9 +68,11 @@ def orthophoto(
     Cells that no view shows take the colour of the surface model. ``progress`` is called STEPS
     times.
     """
-    images = images_of(views, np.zeros((0, 3, 2), np.float32))
-    found = _sightings(terrain, views, images, progress)
+    found = _sightings(terrain, views, progress)
     progress("painting the orthophoto")
+    gains, places = levels(found, len(views)), terrain.places_m.reshape(-1, 3)
+    fields, found = faded_steps(places, np.ones(len(places)), views, found, gains)
+    found = consistent(found)
     label = found.view[:, 0]
     if terrain.objects is not None:
         label = one_view_each(found, terrain.objects.ravel())
@@ -85,7 +88,7 @@ def orthophoto(
     parallel_for(
         _paint, len(rgb), np.ascontiguousarray(terrain.places_m), _axes(terrain.places_m),
         terrain.raster.height_m, terrain.raster.rgb, np.ascontiguousarray(label),
-        images._replace(levels=levels(found, len(views))), to_cell, rgb, known,
+        images_of(views, gains, fields), to_cell, rgb, known,
     )  # fmt: skip
     return rgb, known
 
@@ -93,12 +96,11 @@ def orthophoto(
 def _sightings(
     terrain: Terrain,
     views: Sequence[TextureView],
-    images: Images,
     progress: Callable[[str], None],
 ) -> TriangleViews:
     """The views of each cell, the best first: pixels per metre times the cosine to the vertical,
-    less where an image is blurred; without those whose colour differs from most others."""
-    raster = terrain.raster
+    less where an image is blurred."""
+    raster, images = terrain.raster, images_of(views, np.zeros((0, 3, 2), np.float32))
     rows, cols = raster.grid.shape
     out = TriangleViews.none(rows * cols)
     eyes = np.column_stack([raster.grid.pixels(terrain.eyes_m[:, :2]), terrain.eyes_m[:, 2]])
@@ -177,7 +179,6 @@ def _look(
                 score = images.K[number, 0, 0] / depth * abs(up) * sharp[number]
                 score /= np.sqrt(east**2 + north**2 + up**2)
                 insert(view[n], px[n], bgr[n], number, np.float32(score), colour)
-    drop_outliers((first + begin) * cols, (first + end) * cols, view, px, bgr)
 
 
 @njit(cache=True, nogil=True)

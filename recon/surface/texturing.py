@@ -68,7 +68,9 @@ def texture(
     label = np.where(slot >= 0, found.view[np.arange(len(slot)), slot], -1).astype(np.int32)
     progress("levelling exposures")
     gains = levels(found, len(views))
-    fields, found = faded_steps(mesh, views, found, gains)
+    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    fields, found = faded_steps((a + b + c) / 3.0, area, views, found, gains)
     fade_view, fade_share = fading(mesh.faces, label, len(mesh.vertices_m), len(views))
     progress("packing the atlas")
     rgb = spread_colours(mesh.faces, mesh.rgb, found, slot)
@@ -79,8 +81,6 @@ def texture(
     image = paint(mesh, layout, found, label, neighbours, palette)
     used = np.unique(label[label >= 0])
     charts = len(np.unique(layout.chart[label >= 0]))
-    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     seen = float(area[label >= 0].sum() / max(area.sum(), 1e-12))
     return Textured(_split(mesh, layout), image, seen, len(used), charts, layout.scale)
 
@@ -363,17 +363,17 @@ def levelled(found: TriangleViews, gains: F32) -> TriangleViews:
 
 
 def faded_steps(
-    mesh: Mesh, views: Sequence[TextureView], found: TriangleViews, gains: F32
+    middle_m: F64, area: F64, views: Sequence[TextureView], found: TriangleViews, gains: F32
 ) -> tuple[list[F32], TriangleViews]:
     """For each view (rows, cols, 4) factors over its image, before its gains (views, 3, 2), that
     take it to the mean of what all views of a place show after theirs; ``found`` after both.
+
+    The places are those of ``found``: triangles or cells, with their middles (N, 3) and areas (N,).
 
     One gain for an image leaves steps where haze, a cloud's edge or the lens make it brighter in
     one part only. A factor is of surroundings as wide as FIELD_SIGMA, so details stay. Where no
     other view sees a place, it is 1.
     """
-    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
-    middle, area = (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)
     is_seen = found.view >= 0  # views that were dropped leave their colours behind
     total = (levelled(found, gains).bgr * is_seen[..., None]).sum(axis=1)
     mean = total / np.maximum(is_seen.sum(axis=1), 1)[:, None]
@@ -382,7 +382,7 @@ def faded_steps(
         f, slot = np.nonzero(found.view == number)
         h, w = view.bgra.shape[:2]
         rows, cols = (max(2, round(FIELD_CELLS * side / max(h, w))) for side in (h, w))
-        place = (projected(view, middle[f]) + 0.5) * [cols / w, rows / h]
+        place = (projected(view, middle_m[f]) + 0.5) * [cols / w, rows / h]
         col, row = np.clip(place.astype(np.int64), 0, [cols - 1, rows - 1]).T
         weight = area[f] * found.px_per_m[f, slot] ** 2
         before_gain = (mean[f] - gains[number, :, 1]) / np.maximum(gains[number, :, 0], 1e-3)

@@ -129,6 +129,18 @@ def test_exposures_are_levelled() -> None:
     assert abs(west / east - 1.0) < 0.1  # 0.67 without
 
 
+def test_an_image_that_is_brighter_in_one_part_leaves_no_seam() -> None:
+    plain = [view(x, 12.0) for x in (4.0, 12.0, 20.0)]
+    shade = np.linspace(1.3, 0.7, 400)[:, None]  # no gain of a whole image removes it
+    shaded = [*plain[:1], view(12.0, 12.0), *plain[2:]]
+    shaded[1].bgra[..., :3] = (shaded[1].bgra[..., :3] * shade).clip(0, 255)
+    want, _ = orthophoto(terrain(plain), plain, FINE)
+    found, _ = orthophoto(terrain(shaded), shaded, FINE)
+    clear = np.s_[30:80], np.s_[5:235]  # north of the block
+    ratio = (found[clear].astype(float).sum(axis=2) / want[clear].sum(axis=2)).mean(axis=0)
+    assert np.abs(ratio[10:] - ratio[:-10]).max() < 0.025  # 0.037 with gains alone
+
+
 def test_no_seam_runs_across_an_object_that_one_view_sees() -> None:
     view = np.array([[0, 1, 2], [0, 1, -1], [1, 0, 2], [1, 0, -1], [2, -1, -1], [0, 2, -1]])
     px = np.array([[9, 8, 1], [9, 8, 0], [9, 8, 1], [9, 7, 0], [5, 0, 0], [9, 1, 0]])

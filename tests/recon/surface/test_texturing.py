@@ -113,7 +113,7 @@ def test_views_that_are_brighter_in_one_part_leave_no_step() -> None:
     for view in views:
         view.bgra[..., :3] = np.clip(view.bgra[..., :3] * shade, 0, 255)
     found = look(mesh, views)
-    fields, after = faded_steps(mesh, views, found, as_they_are(3))
+    fields, after = faded_steps(*middles(mesh), views, found, as_they_are(3))
     both = found.view[:, 1] >= 0
     before_apart, apart = (np.abs(o.bgr[both, 0] - o.bgr[both, 1]).mean() for o in (found, after))
     assert before_apart > 5.0 and apart < 0.4 * before_apart
@@ -123,6 +123,11 @@ def test_views_that_are_brighter_in_one_part_leave_no_step() -> None:
     for view, factor in zip(views, seen[..., :3].mean(axis=(1, 3)), strict=True):
         own = view.bgra[40:200, 40:280, :3].mean(axis=(0, 2))
         assert np.polyfit(x, factor / own, 1)[0] > 0.0  # against the shade
+
+
+def middles(mesh: Mesh) -> tuple[F64, F64]:
+    """(F, 3) of the triangles of a sheet, all of one size."""
+    return mesh.vertices_m[mesh.faces].mean(axis=1), np.ones(len(mesh.faces))
 
 
 def as_they_are(views: int) -> F32:
@@ -135,7 +140,7 @@ def test_what_stood_before_one_image_leaves_the_brightness_of_the_others() -> No
     views = [image(np.array([x, 0.0, 14.0])) for x in (-2.0, -1.0, 0.0, 1.0, 2.0)]
     views[2].bgra[60:180, 80:240, :3] = 255  # left out by the next line
     found = consistent(look(mesh, views))
-    fields, _ = faded_steps(mesh, views, found, as_they_are(5))
+    fields, _ = faded_steps(*middles(mesh), views, found, as_they_are(5))
     for number in (0, 1, 3, 4):
         assert np.abs(fields[number] - 1.0).max() < 0.02
 
@@ -144,7 +149,9 @@ def test_an_image_that_no_other_overlaps_stays_as_it_is() -> None:
     mesh = sheet()
     for eyes in ([0.0], [-60.0, 0.0, 60.0]):
         views = [image(np.array([x, 0.0, 14.0])) for x in eyes]
-        fields, after = faded_steps(mesh, views, look(mesh, views), as_they_are(len(views)))
+        fields, after = faded_steps(
+            *middles(mesh), views, look(mesh, views), as_they_are(len(views))
+        )
         assert all((field == 1.0).all() for field in fields)
         assert (after.bgr == look(mesh, views).bgr).all()
 
@@ -158,7 +165,7 @@ def test_a_field_and_the_gain_after_it_end_at_the_mean(level: int, offset: float
     gains = as_they_are(2)
     gains[1, :, 1] = offset
     found = look(mesh, views)
-    fields, after = faded_steps(mesh, views, found, gains)
+    fields, after = faded_steps(*middles(mesh), views, found, gains)
     assert np.min(fields) >= 0.5 and np.max(fields) <= 2.0
     images = images_of(views, gains, fields)
     shows = images.pixels.reshape(2, 240, 320, 4)[:, 120, 160, :3] + gains[:, :, 1]
