@@ -78,7 +78,7 @@ def test_unknown_ground_around_a_box_does_not_make_it_wider() -> None:
 def test_gaps_between_level_cells_are_closed_up_to_the_edge_of_a_roof_and_no_further() -> None:
     whole = surface(1, [(60, 60, 40, 40, 6.0)])
     height = whole.height_m.copy()
-    height[58:102, [59, 61, 80, 98]] = np.nan  # beside the roof, and through it along its edges
+    height[58:102, [59, 61, 80, 98]] = np.nan  # next to the roof, and through it along its edges
     height[[60, 99], 85:90] = np.nan  # the edges themselves
     filled = level_filled(replace(whole, height_m=height), 2)
     assert np.isfinite(filled.height_m[61:99, [61, 80, 98]]).all()
