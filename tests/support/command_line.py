@@ -35,6 +35,16 @@ def skyrelief(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 @contextmanager
+def interruptible() -> Iterator[None]:
+    """Ctrl-C is heard, by new processes too, though a shell's background job ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
 def command_process(log: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
     """A command in a process of its own, which writes to ``log`` and is ended at the end."""
     with log.open("wb") as said:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import command_process, skyrelief
+from command_line import command_process, interruptible, skyrelief
 from house_flight import HouseFlight
 from loopback import until
 
@@ -62,7 +62,7 @@ def test_a_stopped_simulation_leaves_nothing(tmp_path: Path) -> None:
     place.mkdir()
     long = ("--duration-s", "20", "--fps", "30", "--size", "64x64", "--density", "0")
     command = ("simulate", "--out", str(place / "flight"), *long)
-    with command_process(tmp_path / "log", *command) as simulating:
+    with interruptible(), command_process(tmp_path / "log", *command) as simulating:
         assert until(lambda: [*place.rglob("*.mp4")], 120.0)
         simulating.send_signal(signal.SIGINT)
         assert simulating.wait(120.0) != 0

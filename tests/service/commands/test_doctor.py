@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import interruptible
 from file_modes import bound_by_modes
 from loopback import free_port, until
 from paths import DEMO
@@ -50,7 +51,7 @@ def test_links_are_closed_where_it_is_interrupted() -> None:
         _thread.interrupt_main()
 
     threading.Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(KeyboardInterrupt):
+    with interruptible(), pytest.raises(KeyboardInterrupt):
         findings(f"mavlink.links=udpin:127.0.0.1:{free_port()}", listen_s=60.0)
     assert not threads()
 
