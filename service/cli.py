@@ -100,7 +100,7 @@ class LazyCommands(typer.core.TyperGroup):
             _end(CancelledByUser("cancelled"))
         except Exception as error:
             cause: BaseException | None = error
-            while isinstance(cause, SystemError):  # numba's, of a signal during a kernel
+            while isinstance(cause, SystemError | ImportError):  # of a signal in compiled code
                 cause = cause.__cause__
             if isinstance(cause, KeyboardInterrupt | CancelledError):
                 _end(CancelledByUser("cancelled"))

@@ -103,27 +103,30 @@ def test_a_command_that_is_killed_removes_its_temporary_files(
     assert not list(tmp_path.glob("tmp*"))
 
 
+@pytest.mark.parametrize("error", [SystemError, ImportError])
 @pytest.mark.parametrize(
     "raised, code, said",
     [(KeyboardInterrupt(), 130, "skyrelief: cancelled\n"), (SystemExit(143), 143, "")],
 )
-def test_a_signal_during_a_kernel_ends_the_command_in_order(
+def test_a_signal_in_compiled_code_ends_the_command_in_order(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    error: type[Exception],
     raised: BaseException,
     code: int,
     said: str,
 ) -> None:
-    """As numba passes it on: an error of an error of the signal's exception."""
+    """As numba passes it on, and Open3D while it loads: an error of an error of the signal's
+    exception."""
 
     def kernel() -> None:
         try:
             try:
                 raise raised
             except BaseException as signalled:
-                raise SystemError("unpickling returned a result with an exception") from signalled
-        except SystemError as error:
-            raise SystemError("the kernel returned a result with an exception") from error
+                raise error("unpickling returned a result with an exception") from signalled
+        except error as first:
+            raise error("the kernel returned a result with an exception") from first
 
     working(kernel, monkeypatch)
     with pytest.raises(SystemExit) as ended:
