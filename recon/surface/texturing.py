@@ -59,7 +59,7 @@ def texture(
     def share(done: float) -> None:
         if int(10 * done) > reported[0]:
             reported[0] = int(10 * done)
-            progress(f"visibility {10 * reported[0]} %")
+            progress("which triangles each view sees")
 
     found = consistent(look(mesh, views, share))
     progress("choosing a view for each triangle")
