@@ -73,8 +73,13 @@ def _gps_raw(m: Message) -> Sample | None:
     fix = m.fix_type >= 3
     sigma_h = m.h_acc * 1e-3 if m.h_acc else _from_dop(m.eph, RECEIVER_SIGMA_H_M)
     sigma_v = m.v_acc * 1e-3 if m.v_acc else _from_dop(m.epv, RECEIVER_SIGMA_V_M)
-    alt_m = m.alt * 1e-3 if fix else None
-    return AccuracySample(None, fix, sigma_h, sigma_v, alt_m, is_claimed=m.h_acc > 0)
+    alt_m, place = m.alt * 1e-3 if fix else None, None
+    lat, lon, course = m.lat * 1e-7, m.lon * 1e-7, math.radians(m.cog * 0.01)
+    if fix and plausible_place(lat, lon):
+        speed = math.nan if UNKNOWN_U16 in (m.vel, m.cog) else m.vel * 0.01
+        velocity = (speed * math.cos(course), speed * math.sin(course), math.nan)
+        place = PositionSample(None, lat, lon, alt_m, None, velocity)
+    return AccuracySample(None, fix, sigma_h, sigma_v, alt_m, m.h_acc > 0, place)
 
 
 def _from_dop(dop_cent: int, unknown_m: float) -> float:

@@ -96,6 +96,7 @@ class VehicleHistory:
         self._given_up_ns = 0  # up to here nothing is waited for again
         self._attitude: TimeSeries[AttitudeSample] = TimeSeries()
         self._position: TimeSeries[PositionSample] = TimeSeries()
+        self._fixes: TimeSeries[PositionSample] = TimeSeries()  # of the receiver
         self._accuracy: TimeSeries[AccuracySample] = TimeSeries()
         self._range: TimeSeries[RangeSample] = TimeSeries()
         self._terrain: TimeSeries[TerrainSample] = TimeSeries()
@@ -111,13 +112,18 @@ class VehicleHistory:
         self._seen: GimbalFrame | None = None  # by the images
 
     @property
+    def _places(self) -> TimeSeries[PositionSample]:
+        """The estimator's positions; the receiver's where it has sent none."""
+        return self._fixes if self._position.first_ns is None else self._position
+
+    @property
     def first_ns(self) -> int | None:
-        times = [t.first_ns for t in (self._attitude, self._position) if t.first_ns is not None]
+        times = [t.first_ns for t in (self._attitude, self._places) if t.first_ns is not None]
         return min(times, default=None)
 
     @property
     def last_ns(self) -> int | None:
-        times = [t.last_ns for t in (self._attitude, self._position) if t.last_ns is not None]
+        times = [t.last_ns for t in (self._attitude, self._places) if t.last_ns is not None]
         return max(times, default=None)
 
     def covers(self, time_ns: int, until_ns: float = math.inf) -> bool:
@@ -134,7 +140,7 @@ class VehicleHistory:
                     for t in tracks
                     if t.last_ns is not None and t.last_ns > time_ns - MAX_GAP_NS
                 ]
-                for tracks in (gimbals, (self._attitude, self._position))
+                for tracks in (gimbals, (self._attitude, self._places))
             )
         return all(last >= time_ns or due > until_ns for last, due in (*heads[:1], *bodies))
 
@@ -197,15 +203,18 @@ class VehicleHistory:
         return found or self.bodies(since_ns, until_ns)
 
     def __len__(self) -> int:
-        return len(self._attitude) + len(self._position)
+        return len(self._attitude) + len(self._places)
 
     def add(self, sample: Sample, time_ns: int) -> None:
         """Insert a sample at its time; order does not matter."""
         with self._lock:
-            track = self._track(sample)
-            track.add(time_ns, sample)
-            if math.isfinite(self.config.keep_s):
-                track.forget_before(time_ns - int(self.config.keep_s * 1e9))
+            kept: list[tuple[TimeSeries[Any], Sample]] = [(self._track(sample), sample)]
+            if isinstance(sample, AccuracySample) and sample.place is not None:
+                kept.append((self._fixes, sample.place))
+            for track, one in kept:
+                track.add(time_ns, one)
+                if math.isfinite(self.config.keep_s):
+                    track.forget_before(time_ns - int(self.config.keep_s * 1e9))
         if self._waiting:
             with self._news:
                 self._news.notify_all()
@@ -231,7 +240,7 @@ class VehicleHistory:
 
     def clear(self) -> None:
         with self._lock:
-            for track in self._tracks.values():
+            for track in (*self._tracks.values(), self._fixes):
                 track.clear()
             self._gimbals.clear()
             self._judged.clear()
@@ -366,7 +375,7 @@ class VehicleHistory:
         return steadiest_frame(sent, bodies, max(1, round(JUDGE_LAG_NS / spacing_ns)))
 
     def _add_position(self, state: _Assembly) -> Bracket[PositionSample] | None:
-        at = self._position.around(state.time_ns, POSITION_GAP_NS)
+        at = self._places.around(state.time_ns, POSITION_GAP_NS)
         if at is None:
             return None
         accuracy = self._accuracy.around(state.time_ns, ACCURACY_GAP_NS, ACCURACY_GAP_NS)

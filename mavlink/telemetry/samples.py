@@ -46,7 +46,7 @@ class AttitudeSample(Sample):
 
 @dataclass(frozen=True, slots=True)
 class PositionSample(Sample):
-    """The estimator's position."""
+    """The estimator's position, or a receiver's without one."""
 
     lat_deg: float  # NaN, like the longitude: only the height above home is known
     lon_deg: float
@@ -57,13 +57,14 @@ class PositionSample(Sample):
 
 @dataclass(frozen=True, slots=True)
 class AccuracySample(Sample):
-    """The GNSS receiver's own estimate of its accuracy, 1 sigma, and its own altitude."""
+    """The GNSS receiver's own estimate of its accuracy, 1 sigma, its own altitude and position."""
 
     has_fix: bool
     sigma_h_m: float
     sigma_v_m: float
     alt_amsl_m: float | None = None
     is_claimed: bool = True  # False: typical of receivers, as this one states none
+    place: PositionSample | None = None  # for want of an estimator's
 
 
 @dataclass(frozen=True, slots=True)

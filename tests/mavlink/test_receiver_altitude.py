@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
 
@@ -59,6 +61,32 @@ def test_the_prior_says_whether_the_receiver_claims_its_accuracy(h_acc_mm: int) 
     assert prior.sigma_position_m is not None
     assert prior.sigma_position_m[0] == pytest.approx(0.9 if h_acc_mm else 1.2, rel=0.01)
     assert prior.is_sigma_claimed is bool(h_acc_mm)
+
+
+def test_a_receiver_alone_places_the_camera_until_an_estimator_speaks() -> None:
+    history = VehicleHistory()
+    for k in range(4):  # 10 m/s to the north-east, climbing, no height above home
+        step_m = 10.0 * 0.2 * k / math.sqrt(2.0)
+        lat = round(470000000 + step_m / 111_319.49 * 1e7)
+        message = dialect.MAVLink_gps_raw_int_message(
+            0, 3, lat, 80000000, 500000 + 100 * k, 80, 120, 1000, 4500, 14, 0, 900, 1400, 0, 0
+        )
+        sample = decode(message)
+        assert sample is not None
+        history.add(sample, round(0.2 * k * S))
+    state = history.state_at(round(0.3 * S))
+    assert state is not None and state.lat_deg is not None and state.alt_amsl_m is not None
+    assert (state.lat_deg - 47.0) * 111_319.49 == pytest.approx(3.0 / math.sqrt(2.0), abs=0.02)
+    assert state.alt_amsl_m == pytest.approx(500.15)
+    assert state.sigma_h_m == pytest.approx(0.9, abs=0.01) and state.is_claimed
+    assert state.receiver is None and state.v_ned_m_s is None and state.alt_agl_m is None
+    assert (history.first_ns, history.last_ns, len(history)) == (0, round(0.6 * S), 4)
+    for t in (0.2, 0.4):
+        history.add(PositionSample(None, 46.0, 8.0, 400.0, 30.0, None), round(t * S))
+    state = history.state_at(round(0.3 * S))
+    assert state is not None and state.lat_deg == 46.0 and state.alt_agl_m == 30.0
+    history.clear()
+    assert history.state_at(round(0.3 * S)) is None
 
 
 def test_only_a_fix_has_an_altitude() -> None:
