@@ -35,6 +35,7 @@ from recon.posegraph.sensor_noise import (
     Noise,
     bias_time_constant_s,
     drift_noise,
+    fresh_shares,
     gauss_markov_noise,
 )
 from recon.similarity import umeyama
@@ -105,7 +106,8 @@ def fit(
     covariance[6, 6] += SIGMA_STEP**2 / max(len(usable) - 1, 1)
     mean = counted = None
     if len(readings.fix):
-        covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.claimed), axis=0))
+        claimed = readings.claimed * noise.over_claim
+        covariance[3:6, 3:6] += np.diag(np.mean(np.square(claimed), axis=0))
     if len(readings.fix) and fix_s > 0:
         mean, counted = noise.of_mean(readings.claimed, readings.fix_s, fix_s)
     similarity = replace(
@@ -113,10 +115,12 @@ def fit(
         sigma_counted=counted, span_s=readings.span_s, heights=heights,
     )  # fmt: skip
     views = [a.prior for a in usable if a.prior.R_world_camera is not None]
-    if any(v.sigma_tilt_rad < ASSUMED_TILT_RAD for v in views) or not len(readings.fix):
+    is_known = any(v.sigma_tilt_rad < ASSUMED_TILT_RAD for v in views)
+    off = readings.tilt_off(best.at)
+    if not len(readings.fix) or (is_known and not off.any()):
         return similarity
     lean = np.zeros((6, 6))
-    lean[:2, :2] = covariance[:2, :2]
+    lean[:2, :2] = covariance[:2, :2] + np.outer(off, off)
     centre = similarity.points(readings.x.mean(axis=0))
     return replace(similarity, lean=se3.about(-centre, lean))
 
@@ -184,11 +188,11 @@ def _of_fixes(
     )
     if across is None or along is None or flat_off is None or high_off is None:
         return ReadingNoise(tilt=tilt)
-    claimed = np.median(fixes.claimed, axis=0)
+    claimed, span_s = np.median(fixes.claimed, axis=0), float(np.ptp(fixes.fix_s))
     flat, high = float(claimed[:2].mean()), float(claimed[2])
+    over = fixes.over_claim(apart, at.scale, [across.white, along.white])
     least = 1.0 if is_claimed else MIN_BIAS
     reach = across.reach(flat, min(least, slow_share))
-    span_s = float(np.ptp(fixes.fix_s))
     most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift_m)
     flat_s, high_s = bias_time_constant_s(most, fix_s), bias_time_constant_s(high, fix_s)
     vertical = along.bounded(high, high_s, MIN_BIAS * drift)
@@ -199,9 +203,11 @@ def _of_fixes(
             flat_off.drifting(most, flat_s, span_s),
             high_off.drifting(high, high_s, span_s) if is_claimed else vertical,
         ),
-        reach_m=np.array([reach, reach, along.reach(high, least)]),
+        reach_m=over * [reach, reach, along.reach(high, least)],
         tilt=tilt,
         claimed=claimed,
+        over_claim=over,
+        fresh_share=fresh_shares(apart),
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.ground import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import MIN_FIX_M, has_fix, off_attitudes
-from recon.posegraph.records import Node
+from recon.posegraph.records import FRAME_DRIFT, Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S, Noise, bias_time_constant_s, inflation
 from recon.similarity import Similarity
 from recon.types import F64, Bool, PosePrior
@@ -30,6 +30,7 @@ USUAL_RATE_M_S, RATE_S = 0.05, 20.0  # slow part of a velocity's error: sigma an
 MIN_WAY_S = 1e-3  # time that no way by velocity is shorter than
 UNKNOWNS = 11  # rotation, shift and log scale; an assumed view's mount and the drift of altitudes
 AXES = (slice(0, 2), slice(2, 3))  # those of a position that err alike: horizontal and vertical
+LEVEL_SIGMAS = 3.0  # so many of an attitude's by which it and fixes differ on what is level
 TINY = 1e-6  # sigma of what no reading has
 
 
@@ -48,6 +49,8 @@ class ReadingNoise:
     reach_m: F64 | None = None  # (3,) how far fixes may wander
     tilt: Noise | None = None  # of an assumed view about its mount, rad
     claimed: F64 | None = None  # (3,) m as the fixes claim it
+    over_claim: F64 = field(default_factory=lambda: np.ones(3))  # times their scatter exceeds it
+    fresh_share: F64 = field(default_factory=lambda: np.ones(3))  # of fixes, by their correlation
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
     rate_m_s: float = USUAL_RATE_M_S  # of the velocity, which errs so for RATE_S
 
@@ -93,11 +96,12 @@ class ReadingNoise:
     def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
         """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
         the readings in a graph count for it."""
-        usual, span_s = np.median(claimed, axis=0), float(np.ptp(times_s))
+        usual, count, span_s = np.median(claimed, axis=0), len(claimed), float(np.ptp(times_s))
         if (known := self.by_axis) is None or self.reach_m is None:
             return usual, usual / np.sqrt(1.0 + span_s / (2.0 * fix_s))
-        mean = [one.of_mean(float(m), span_s) for one, m in zip(known, self.reach_m, strict=True)]
-        counted = [one.effective_sigma(len(claimed), span_s) / len(claimed) ** 0.5 for one in known]
+        far = zip(known, self.reach_m, count * self.fresh_share, strict=True)
+        mean = [one.of_mean(float(m), float(n), span_s) for one, m, n in far]
+        counted = [one.effective_sigma(count, span_s) / count**0.5 for one in known]
         return np.array(mean), np.array(counted)
 
     def of_travels(self, seconds: F64) -> F64:
@@ -164,6 +168,7 @@ class AlignmentReadings:
         self.heading_known = self.sigma_turn[:, 2] < KNOWN_YAW_RAD
         self.tilt_s = _stack([a.time_s for a in turned if a.prior.is_view_assumed], ())
         known_s = [a.time_s for a in turned if not a.prior.is_view_assumed]
+        self.claimed_tilt = self.sigma_turn[~self.is_assumed, 0].copy()
         span_s = float(np.ptp(known_s)) if known_s else 0.0
         self.sigma_turn[~self.is_assumed] *= inflation(len(known_s), span_s, attitude_s)
         self.sigma_turn[self.is_assumed, :2] = noise.of_tilts(
@@ -324,6 +329,23 @@ class AlignmentReadings:
         of_up = (seen @ se3.hat(R_prior[:, 2])) * self.is_assumed[:, None, None]
         of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
         return off_attitudes(seen, R_prior, self.heading_known), of_mount
+
+    def over_claim(self, apart: F64, scale: float, white: Sequence[float]) -> F64:
+        """(3,) times that fixes scatter further than claimed, 1 at least, by how far (m, 3) they
+        are ``apart`` from the track, which drifts as well, and what is ``white`` of that."""
+        drift_m = FRAME_DRIFT * scale * float(np.linalg.norm(np.diff(self.x, axis=0), axis=1).sum())
+        far = [1.4826 * float(np.median(np.abs(apart[:, axes]))) for axes in AXES]
+        seen = np.sqrt(np.maximum(np.square(far) - drift_m**2, np.square(white)))[[0, 0, 1]]
+        return np.asarray(np.maximum(seen / np.median(self.claimed, axis=0), 1.0))
+
+    def tilt_off(self, at: Alignment) -> F64:
+        """(2,) by which known attitudes and fixes differ on what is level; 0 where it may be
+        noise. Neither says which of them is wrong."""
+        if not len(self.claimed_tilt):
+            return np.zeros(2)
+        off: F64 = np.median(self.turned(at)[0][~self.is_assumed, :2], axis=0)
+        is_noise = np.linalg.norm(off) < LEVEL_SIGMAS * np.median(self.claimed_tilt)
+        return np.zeros(2) if is_noise else off
 
 
 def from_middle(time_s: float | F64, middle_s: float, half_s: float) -> F64:

@@ -16,7 +16,7 @@ from recon import se3
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_attitudes
-from recon.posegraph.records import SIGMA_STEP, Loop, Node
+from recon.posegraph.records import FRAME_DRIFT, SIGMA_STEP, Loop, Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
 from recon.posegraph.sensor_offsets import FRAME_SIGMA_RAD, GATE_SIGMAS
@@ -42,7 +42,6 @@ a track whose scale drifts; and where no reading measures it."""
 SIGMA_SCALE_WALK = 0.003  # sigma of the change of the scale from block to block
 BLOCKS_PER_HEIGHT = 2.0  # heights of so many blocks count as one: neighbours see the same relief
 HUBER_SIGMAS = 1.5  # from so many of its residual on a reading loses weight
-FRAME_DRIFT = 0.003  # share of the path flown by which a track may leave the frame of its segment
 SIGMA_LOOP_SCALE = 0.002  # of the ratio of the depths at a loop's ends
 ALTITUDE_SLACK_M = 3.0  # an altitude further beyond its gate has stepped: climbs and gusts do less
 

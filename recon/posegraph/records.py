@@ -64,6 +64,7 @@ class Loop:
         return replace(self, T_a_b=T, covariance=se3.in_units(self.covariance, factor))
 
 
+FRAME_DRIFT = 0.003  # share of the path flown by which a track may leave the frame of its segment
 SIGMA_STEP = 0.002  # sigma of one motion of vision, as a share of its length
 LOOP_WINDOW = 15  # keyframes within which two loops support each other: vision is trusted there
 CHI2_LIMIT = 22.5  # 99.9 % of chi-square with six degrees of freedom

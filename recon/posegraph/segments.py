@@ -271,7 +271,8 @@ class Segments:
             return False
         found = replace(found, bend_rad=_bend_rad(segment.nodes))
         if found.sigma_fixes is not None:
-            most = np.array([np.inf, np.inf, fresh.sigma_up_m])
+            over = 1.0 if found.noise is None else found.noise.over_claim[2]
+            most = np.array([np.inf, np.inf, fresh.sigma_up_m * over])
             found = replace(found, sigma_fixes=np.minimum(found.sigma_fixes, most))
         before = segment.similarity
         if before is not None and segment.is_tied_by_loop:  # which alone says where it is

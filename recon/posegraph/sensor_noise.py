@@ -137,8 +137,9 @@ class Noise:
         independent = min(1.0 + span_s / (2.0 * self.tau_s), count)
         return float(np.sqrt(self.white**2 + self.bias**2 * count / independent))
 
-    def of_mean(self, claimed: float, span_s: float) -> float:
-        """The sigma of the mean error over ``span_s``, with a bias as far as the sensor claims.
+    def of_mean(self, claimed: float, count: float, span_s: float) -> float:
+        """The sigma of the mean error of ``count`` readings over ``span_s``, with a bias as far as
+        the sensor claims.
 
         A flight no longer than the time constant shows how fast a sensor wanders (bias^2 / tau),
         not how far: its mean error is in no residual. Of the claim, only the white part averages
@@ -146,7 +147,7 @@ class Noise:
         """
         far = max(claimed**2 - self.white**2, (MIN_BIAS * claimed) ** 2)
         tau_s = self.tau_s * max(1.0, far / max(self.bias**2, 1e-12))
-        return float(np.sqrt(far / (1.0 + span_s / (2.0 * tau_s))))
+        return float(np.sqrt(far / (1.0 + span_s / (2.0 * tau_s)) + self.white**2 / max(count, 1)))
 
     def reach(self, sigma: float, min_share: float) -> float:
         """How far the sensor may wander: at most its ``sigma``, less where it wanders slowly.
@@ -165,6 +166,15 @@ def inflation(count: int, span_s: float, tau_s: float) -> float:
     if tau_s <= 0:
         return 1.0
     return float(np.sqrt(max(1.0, count / (1.0 + span_s / (2.0 * tau_s)))))
+
+
+def fresh_shares(errors: F64) -> F64:
+    """(C,) shares of (N, C) readings in the order of time that err independently: where one errs as
+    the one before, their mean is less certain than of as many independent ones."""
+    e = errors - np.median(errors, axis=0)
+    alike = np.sum(e[1:] * e[:-1], axis=0) / np.maximum(np.sum(e * e, axis=0), 1e-12)
+    alike = np.clip(alike, 0.0, 0.95)
+    return np.asarray((1.0 - alike) / (1.0 + alike))
 
 
 def bias_time_constant_s(sigma_m: float, usual_s: float) -> float:

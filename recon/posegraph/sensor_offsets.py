@@ -22,7 +22,7 @@ from recon.similarity import lever
 from recon.types import F64, PosePrior
 
 SIGMA_RAD = np.radians(2.0)  # how well a camera is aligned before anything is known
-BOUND_RAD = np.radians(5.0)  # a larger angle is not a boresight but another fault
+BOUND_RAD = np.radians(15.0)  # a larger angle is not a boresight but another fault
 MIN_ATTITUDES = 8  # minimum number of attitudes of a stretch
 WILD = 5.0  # median whitened residual beyond which attitudes and images do not belong together
 SURE = 9.0  # squared sigmas by which a boresight must differ from none to be applied
@@ -130,17 +130,17 @@ def boresight(
         A_ww, g_w = np.add.reduceat(info, first) + 1e-9, -np.add.reduceat(info * r, first)
         A_wb = -np.add.reduceat(info[:, :, None] * Q, first)
         gain = A_wb.transpose(0, 2, 1) / A_ww[:, None]
-        H = np.eye(3) / SIGMA_RAD**2 + np.einsum("nki,nk,nkj->ij", Q, info, Q)
+        before = np.maximum(SIGMA_RAD, np.abs(turn)) ** -2.0  # a large one refutes what is usual
+        H = np.diag(before) + np.einsum("nki,nk,nkj->ij", Q, info, Q)
         H = H - np.sum(gain @ A_wb, axis=0)
         g = np.einsum("nki,nk->i", Q, info * r) - np.einsum("fij,fj->i", gain, g_w)
-        step = np.linalg.solve(H, g - turn / SIGMA_RAD**2)
+        step = np.linalg.solve(H, g - turn * before)
         w = (g_w - A_wb @ step) / A_ww
         frames = se3.each_so3_exp(w) @ frames
         turn = turn + step
-        turn *= min(1.0, BOUND_RAD / max(float(np.linalg.norm(turn)), 1e-12))
         if max(np.abs(step).max(), np.abs(w).max()) < 1e-6:
             break
-    if float(np.median(norms)) > WILD:
+    if float(np.median(norms)) > WILD or float(np.linalg.norm(turn)) > BOUND_RAD:
         return Constants()
     return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))))
 

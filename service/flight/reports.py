@@ -147,8 +147,16 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
             ],
         },
         **_constants(graph.constants()),
+        "over_claim": round(_over_claim(graph), 2),
         "left_out": {str(k): int(v) for k, v in graph.counts.items()},
     }
+
+
+def _over_claim(graph: PoseGraph) -> float:
+    """How many times further fixes scatter than they claim, 1 at least."""
+    largest = graph.segments.largest()
+    noise = None if largest is None else largest.noise
+    return 1.0 if noise is None else float(noise.over_claim.max())
 
 
 def _constants(found: Constants) -> dict[str, Any]:

@@ -46,6 +46,11 @@ REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 less certain than sigma says; above the second, either may be wrong. Where depths of more than the
 second contradict each other, those of the other views may agree by chance."""
 
+LEVELS_DIFFER = "attitudes and positions contradict each other on what is level"
+
+OVER_CLAIM = 2.0
+"""Positions that scatter so many times as far as they claim, or more, are reported."""
+
 MAX_REFUTED_SHARE = 0.05
 """Of the steps of the track; where vision is refuted more often, it errs elsewhere by as much as
 attitude and positions do not show."""
@@ -152,13 +157,17 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     lean_deg = _number(run, "lean_sigma_deg")
     if lean_deg is not None and lean_deg > MAX_LEAN_SIGMA_DEG:
         limits.append(
-            f"the view direction is assumed: all may lean by {lean_deg:.0f} degrees; control "
-            "points level it, or more strips flown both ways"
+            f"{'the view direction is assumed' if 'view' in assumed else LEVELS_DIFFER}: all may "
+            f"lean by {lean_deg:.0f} degrees; control points level it, or more strips flown both "
+            "ways"
         )
     if broken:
         limits.append(f"{refuted}: what they show is left out")
     if refused > REFUSED_SHARE * measured:
         limits.append(f"{contradicted}: they are less certain than sigma says")
+    over = _number(run.get("graph"), "over_claim") or 1.0
+    if over > OVER_CLAIM:
+        limits.append(f"positions scatter {over:.1f} times as far as they claim: sigma follows it")
     if ratio:
         limits.append(scales_differ(ratio))
     return _said(Trust.GEOREFERENCED, limits)

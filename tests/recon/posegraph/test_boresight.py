@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from spied import spied
 
 from recon import parallel, se3
-from recon.posegraph.sensor_offsets import BOUND_RAD, Constants, Turns, boresight, turns_of
+from recon.posegraph.sensor_offsets import Constants, Turns, boresight, turns_of
 from recon.types import F64, PosePrior
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -90,9 +90,17 @@ def test_noise_is_no_boresight_and_a_wrong_frame_neither() -> None:
     assert not boresight([(R_odom, anything, sigma)], 60.0).turn.any()
 
 
-def test_it_is_bounded() -> None:
-    found = boresight([flown(np.radians([0.0, 7.0, 0.0]), [0.0, np.pi], 1)], 600.0)
-    assert np.linalg.norm(found.turn) <= BOUND_RAD + 1e-9
+@pytest.mark.parametrize("turn_deg", [(0.0, 8.0, 0.0), (-9.0, 8.0, 0.0)])
+def test_a_crooked_gimbal_is_found_as_well_as_a_straight_one(turn_deg: F64) -> None:
+    turn = np.radians(turn_deg)
+    found = boresight([flown(turn, [0.4, 0.4 + np.pi, 0.4], 1)], 300.0)
+    off = np.degrees(np.abs(found.turn - turn))[:2]
+    assert off.max() < 0.4 and np.all(off < 3.0 * np.degrees(found.sigma_turn[:2]))
+
+
+def test_a_camera_that_looks_elsewhere_is_not_turned() -> None:
+    found = boresight([flown(np.radians([0.0, 25.0, 0.0]), [0.0, np.pi], 1)], 600.0)
+    assert not found.turn.any() and not found.is_turn_sure
 
 
 def test_a_sure_one_turns_the_attitude() -> None:

@@ -307,11 +307,39 @@ def test_a_wander_reaches_as_far_as_claim_and_speed_say() -> None:
         (Noise(0.1, 1.0, 60.0), 30.0, 0.9),
         (Noise(0.1, 1.0, 10.0), 2000.0, 0.1),  # a hundred independent errors
         (Noise(1.0, 0.25, 60.0), 30.0, 0.25),  # the claim is white noise, which averages out
+        (Noise(3.0, 0.0, 60.0), 30.0, 0.39),  # and more noise than claimed averages out less
         (Noise(0.0, 0.0, 60.0), 1e6, 1.0),
     ],
 )
 def test_the_mean_error_of_a_flight_is_as_far_as_the_sensor_claims(
     noise: Noise, span_s: float, expected: float
 ) -> None:
-    assert noise.of_mean(1.0, span_s) == pytest.approx(expected, rel=0.15)
-    assert noise.of_mean(0.0, span_s) == 0.0
+    assert noise.of_mean(1.0, 100, span_s) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("white", "bias", "tau_s", "most"), [(2.0, 0.0, 60.0, 1.3), (0.1, 3.0, 3.0, 2.0)]
+)
+@pytest.mark.parametrize("legs", [1, 3])
+def test_sigma_of_the_position_covers_fixes_that_scatter_more_than_claimed(
+    white: float, bias: float, tau_s: float, most: float, legs: int
+) -> None:
+    """By several times what the receiver claims: the mean of 40 s errs, and the sigma says so."""
+    off = []
+    for seed in range(8):
+        rng, times = np.random.default_rng(seed), seconds(40)
+        back = np.abs((legs * times / 40.0 + 1.0) % 2.0 - 1.0)
+        at = np.column_stack([200.0 * back, 2.0 * times, 60.0 + 0.3 * np.sin(times)])
+        error = gauss_markov(rng, times, bias, tau_s, 3) + white * rng.normal(size=(40, 3))
+        some = [
+            node(
+                se3.compose(NADIR, p / 1.5), PosePrior(NADIR, 0.01, 0.05, fix, np.full(3, 0.8)),
+                None, 0.0, t,
+            )
+            for p, fix, t in zip(at, at + error, times, strict=True)
+        ]  # fmt: skip
+        found = fit(some)
+        assert found is not None and found.sigma_fixes is not None and found.noise is not None
+        off.append(error.mean(axis=0) / found.sigma_fixes)
+        assert found.noise.over_claim.max() > 1.5
+    assert np.sqrt(np.mean(np.square(off))) < most

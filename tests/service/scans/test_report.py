@@ -12,6 +12,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
 from recon.types import PosePrior
 from service.flight.reports import graph_figures
@@ -198,6 +199,8 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
         def constants(self) -> Constants:
             turn, sigma = np.radians([1.6, -1.2, 0.0]), np.radians([0.2, 0.2, 2.0])
             return Constants(turn, sigma, -0.71234, 0.2)
+
+        segments = Segments()
 
         a, b = 3, 40
         T_a_b = se3.exp(np.array([0.1, 0.0, 0.3, 4.0, 5.0, 6.0]))

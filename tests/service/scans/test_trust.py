@@ -81,6 +81,8 @@ def test_what_is_level_is_as_sure_as_the_track_shows_it() -> None:
     assert unsure["level"] == "georeferenced" and "lean by 6 degrees" in unsure["reasons"][0]
     shown = trust_of(SURE | {"assumed": ["view"], "lean_sigma_deg": 0.3}, "exif", 10.0)
     assert shown["reasons"] == []
+    apart = trust_of(SURE | {"lean_sigma_deg": 4.4}, "gnss")
+    assert "attitudes and positions contradict" in apart["reasons"][0]
 
 
 @pytest.mark.parametrize(
@@ -98,6 +100,15 @@ def test_positions_that_contradict_the_track_limit_it(
     found = trust_of(SURE | {"graph": graph}, "exif")
     assert found["level"] == level
     assert [reason] == [text[: len(reason)] for text in found["reasons"] or [""]]
+
+
+def test_positions_that_scatter_further_than_claimed_are_named() -> None:
+    for over, reasons in (
+        (1.4, []),
+        (3.75, ["positions scatter 3.8 times as far as they claim: sigma follows it"]),
+    ):
+        found = trust_of(SURE | {"graph": {"over_claim": over}}, "gnss")
+        assert found == {"level": "georeferenced", "reasons": reasons}
 
 
 @pytest.mark.parametrize(
