@@ -49,7 +49,11 @@ second contradict each other, those of the other views may agree by chance."""
 LEVELS_DIFFER = "attitudes and positions contradict each other on what is level"
 
 OVER_CLAIM = 2.0
-"""Positions that scatter so many times as far as they claim, or more, are reported."""
+"""Positions that scatter so many times as far as they claim are reported, and vision's scale that
+changes as many times as far as usual."""
+
+SCALE_KINDS = ("scale", "loop scale")
+"""Residuals of the pose graph that show it."""
 
 MAX_REFUTED_SHARE = 0.05
 """Of the steps of the track; where vision is refuted more often, it errs elsewhere by as much as
@@ -170,6 +174,12 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         limits.append(f"positions scatter {over:.1f} times as far as they claim: sigma follows it")
     if ratio:
         limits.append(scales_differ(ratio))
+    wander = _scale_wander(run)
+    if wander > OVER_CLAIM:
+        limits.append(
+            f"vision's scale changes {wander:.1f} times as far as usual: is the image stabilised "
+            "in the camera, or the lens another one?"
+        )
     return _said(Trust.GEOREFERENCED, limits)
 
 
@@ -188,6 +198,15 @@ def _refused(run: Mapping[str, Any], kind: str, why: str) -> tuple[float, float]
     used = residuals.get(kind) if isinstance(residuals, Mapping) else None
     refused = _number(graph.get("left_out"), why) or 0.0
     return refused, refused + (_number(used, "count") or 0.0)
+
+
+def _scale_wander(run: Mapping[str, Any]) -> float:
+    """How many times further vision's scale changes along the track and over loops than usual, 1 at
+    least."""
+    graph = run.get("graph")
+    residuals = graph.get("residuals") if isinstance(graph, Mapping) else None
+    kinds = [residuals.get(k) for k in SCALE_KINDS] if isinstance(residuals, Mapping) else []
+    return max(1.0, *(_number(kind, "rms") or 0.0 for kind in kinds), 0.0)
 
 
 def scales_differ(gnss_over_heights: float) -> str:
@@ -211,6 +230,7 @@ def scale_sigma(run: Mapping[str, Any], georeference: str) -> float | None:
         return None
     ratio = _number(scale, "gnss_over_heights") or 0.0
     apart = math.log(ratio) if ratio > 0.0 else 0.0
+    sigma *= _scale_wander(run)
     return math.hypot(sigma, _number(run, "sigma_focal") or 0.0, apart)
 
 

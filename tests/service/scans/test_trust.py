@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.tracking.frame import CONTRADICTED, TWO_ONLY
-from service.scans.trust import BY_SURVEY, depth_share, slope_deg, trust_of
+from service.scans.trust import BY_SURVEY, depth_share, scale_sigma, slope_deg, trust_of
 
 SURE: dict[str, Any] = {
     "assumed": [],
@@ -109,6 +109,17 @@ def test_positions_that_scatter_further_than_claimed_are_named() -> None:
     ):
         found = trust_of(SURE | {"graph": {"over_claim": over}}, "gnss")
         assert found == {"level": "georeferenced", "reasons": reasons}
+
+
+def test_a_scale_of_vision_that_wanders_is_named_and_less_certain() -> None:
+    """As where the camera stabilises its images: their centre moves against the lens."""
+    still, moved = ({"residuals": {"loop scale": {"count": 9, "rms": r}}} for r in (0.8, 3.0))
+    sure = SURE | {"scale": {"from": "gnss", "sigma": 0.003}}
+    found = trust_of(sure | {"graph": moved}, "gnss")
+    assert found["level"] == "georeferenced" and "changes 3.0 times" in found["reasons"][0]
+    assert trust_of(sure | {"graph": still}, "gnss")["reasons"] == []
+    assert scale_sigma(sure | {"graph": moved}, "gnss") == pytest.approx(0.009)
+    assert scale_sigma(sure | {"graph": still}, "gnss") == pytest.approx(0.003)
 
 
 @pytest.mark.parametrize(
