@@ -80,7 +80,7 @@ def test_the_texture_shows_the_ground_where_it_is() -> None:
     views = [image(np.array([x, y, 14.0])) for x in (-5.0, 5.0) for y in (-5.0, 5.0)]
     said = list[str]()
     done = texture(mesh, views, progress=said.append)
-    assert said.count("which triangles each view sees") > 1  # with no share beside that of all work
+    assert said.count("which triangles each view sees") > 1  # a step has no share of its own
     assert not any("%" in text for text in said)
     assert done.seen_share > 0.99 and done.views_used == 4
     middle, colour = shown(done.mesh, done.image)
