@@ -87,8 +87,8 @@ def _key(call: Call) -> tuple[object, ...]:
 
 @dataclass(slots=True)
 class _Running:
+    component: int
     call: Call
-    key: tuple[object, ...]
     window_ns: int
     work: Work
     until_ns: int
@@ -118,8 +118,7 @@ class CommandDesk:
         self._outbox = outbox
         self._host = host
         self._say = say
-        # By component, number and, of stops, source: each who stops gets the result.
-        self._running: dict[tuple[int, int, Address | None], _Running] = {}
+        self._running: dict[tuple[object, ...], _Running] = {}  # each stop gets its own result
         self._last: _Done | None = None  # shared: both components act on one scan
 
     def receive(self, call: Call, components: tuple[int, ...], now_ns: int) -> None:
@@ -140,19 +139,17 @@ class CommandDesk:
     def _carry_out(self, component: int, command: Command, call: Call, now_ns: int) -> None:
         key = (component, *_key(call))
         is_stop = self._is_stop(call)
-        slot = component, call.number, call.source if is_stop else None
-        same = [at for at in self._running if at[:2] == slot[:2] and (at == slot or not is_stop)]
-        running = self._running[same[0]] if same else None
-        if running is not None and not is_stop:
-            self._answer_while(running, component, call, key)
+        running = [(one.component, one.call.number) for one in self._running.values()]
+        if not is_stop and (component, call.number) in running:
+            self._answer_while(component, call, key)
             return
         last = self._last
         if last is not None and not is_stop and last.key == key and now_ns < last.until_ns:
             self._answer(component, call, Answer(last.answer.result))
             return
         handled = command.handle(call, self._host)
-        if running is not None and isinstance(handled, Work):
-            self._answer_while(running, component, call, key)
+        if key in self._running and isinstance(handled, Work):
+            self._answer_while(component, call, key)
         elif handled is None:
             if not call.is_broadcast:
                 self._answer(component, call, Answer(Result.DENIED))
@@ -160,7 +157,7 @@ class CommandDesk:
             window_ns = int(command.window_s * S)
             limit_ns, report_ns = now_ns + WORK_LIMIT_NS, now_ns + PROGRESS_EVERY_NS
             self._last = None
-            self._running[slot] = _Running(call, key, window_ns, handled, limit_ns, report_ns)
+            self._running[key] = _Running(component, call, window_ns, handled, limit_ns, report_ns)
             if handled.answer is None and not handled.is_brief:
                 self._progress(component, call, handled)
             self.tick(now_ns)
@@ -168,12 +165,10 @@ class CommandDesk:
             self._answer(component, call, handled)
             self._remember(key, handled, now_ns, int(command.window_s * S))
 
-    def _answer_while(
-        self, running: _Running, component: int, call: Call, key: tuple[object, ...]
-    ) -> None:
+    def _answer_while(self, component: int, call: Call, key: tuple[object, ...]) -> None:
         """Acknowledge while this command runs; only one final result can be reported."""
-        if running.key == key:
-            self._progress(component, call, running.work)
+        if key in self._running:
+            self._progress(component, call, self._running[key].work)
         else:
             self._answer(component, call, BUSY)
 
@@ -195,19 +190,19 @@ class CommandDesk:
 
     def tick(self, now_ns: int) -> None:
         """Report progress and final results of running work."""
-        for slot, running in list(self._running.items()):
-            component, answer = slot[0], running.work.answer
+        for key, running in list(self._running.items()):
+            component, answer = running.component, running.work.answer
             if isinstance(answer, Work):
                 running.work, answer = answer, None
             if answer is None and now_ns >= running.until_ns:
                 running.work.cancel()
                 answer = Answer(Result.FAILED, "timed out")
             if answer is not None:
-                del self._running[slot]
+                del self._running[key]
                 if running.work.cancelled and answer.result is Result.ACCEPTED:
                     answer = Answer(Result.CANCELLED)
                 self._answer(component, running.call, answer)
-                self._remember(running.key, answer, now_ns, running.window_ns)
+                self._remember(key, answer, now_ns, running.window_ns)
             elif now_ns >= running.next_report_ns:
                 running.next_report_ns = now_ns + PROGRESS_EVERY_NS
                 self._progress(component, running.call, running.work)

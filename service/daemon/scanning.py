@@ -419,8 +419,6 @@ class Scanning:
         self._end_run(run, fault)
 
     def _end_run(self, run: ScanRun, fault: str) -> None:
-        if run.work is not None:
-            self.resumption.settle()
         with self._lock:
             if fault:
                 self.fault = fault
@@ -431,6 +429,8 @@ class Scanning:
             if fault and self.life.state.is_wanted:
                 log.warning("next attempt in %.1f s", self.life.due_s - self._clock_s())
             self.run = None
+        if run.work is not None:  # and from here on none can ask for it
+            self.resumption.settle()
         if not run.is_left:
             run.finish(fault)
 

@@ -226,6 +226,18 @@ def test_a_stop_does_not_wait_for_other_work(ends: Ends) -> None:
     assert ends.control.asked == ["finalise", "start_scan", "stop_scan"]
 
 
+def test_a_stop_of_what_started_while_files_are_written_is_not_called_rejected(ends: Ends) -> None:
+    """Both come from one station, as commands of one number."""
+    writes = ends.control.works["finalise"] = Work()
+    ends.command(31010, 191, 5)
+    stops = ends.control.works["stop_scan"] = Work(is_brief=True)
+    assert ends.command(31010, 191, 8) == []
+    stops.finish()
+    assert results(ends.pass_time(0.1), 31010) == [ACCEPTED]
+    writes.finish(Answer(Result.FAILED))
+    assert results(ends.pass_time(0.1), 31010) == [FAILED]
+
+
 def test_a_start_ends_a_pause_and_goes_before_the_next_attempt(ends: Ends) -> None:
     for phase in (Phase.PAUSED, Phase.WAITING):
         ends.pass_time(5.0)

@@ -23,7 +23,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from loopback import until
-from onboard import FakeCamera, Onboard
+from onboard import FakeCamera, HeardVehicle, Onboard
 
 from mavlink.component.control import Answer, Phase, Result, Work
 from mavlink.component.presence import Health
@@ -189,9 +189,12 @@ def test_a_stop_forgets_a_scan_to_resume(tmp_path: Path) -> None:
 class StalledDisk(Resumption):
     """Its folder is on the disk once :attr:`goes_on` is set."""
 
-    goes_on: threading.Event
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.goes_on, self.waiting = threading.Event(), list[str]()
 
     def settle(self) -> None:
+        self.waiting.append(threading.current_thread().name)
         self.goes_on.wait(60.0)
         super().settle()
 
@@ -201,7 +204,6 @@ def test_a_stop_is_accepted_once_the_disk_has_it_and_holds_nobody_up(
     finalise: bool, tmp_path: Path
 ) -> None:
     resumption = StalledDisk(tmp_path)
-    resumption.goes_on = threading.Event()
     begun = list[ScanRun]()
     daemon = Onboard(tmp_path, script=begun.append, resumption=resumption)
     daemon.actions.is_ready = True
@@ -212,6 +214,27 @@ def test_a_stop_is_accepted_once_the_disk_has_it_and_holds_nobody_up(
     resumption.goes_on.set()
     until(lambda: work.answer)
     assert isinstance(work.answer, Answer) and work.answer.result is Result.ACCEPTED
+
+
+def test_a_finalise_as_the_scan_ends_waits_for_the_disk_too(tmp_path: Path) -> None:
+    works = list[Work]()
+
+    class Asking(HeardVehicle):
+        def statustext(self, text: str, severity: int = 0, is_answer: bool = False) -> None:
+            if "camera gone" in text:
+                works.append(daemon.actions.finalise())
+
+    def script(_: ScanRun) -> None:
+        raise OutsideError("camera gone")
+
+    resumption = StalledDisk(tmp_path)
+    daemon = Onboard(tmp_path, script=script, link=Asking, resumption=resumption)
+    daemon.actions.is_ready = True
+    daemon.actions.start_scan()
+    assert until(lambda: {"scan", "stop"} <= set(resumption.waiting))
+    assert works[0].answer is None
+    resumption.goes_on.set()
+    assert until(lambda: works[0].answer)
 
 
 # ---- a pause, a photo, a text --------------------------------------------------------------------
