@@ -109,7 +109,9 @@ def drawn(page: Browser) -> int:
     return int(str(seen[-1][1]))
 
 
-def test_the_time_slider_shows_the_cloud_as_it_was(page: Browser) -> None:
+def test_the_time_slider_shows_the_cloud_as_it_was(
+    page: Browser, tmp_path: Path, house: HouseFlight
+) -> None:
     whole = drawn(page)
     page.run(SET.format(".time input", "2"))
     assert drawn(page) == pytest.approx(whole * 2 / 5, rel=0.05)
@@ -128,6 +130,14 @@ def test_the_time_slider_shows_the_cloud_as_it_was(page: Browser) -> None:
     )  # asks for nothing by itself
     page.run(SET.format(".time input", "3"))
     page.wait(f"{caption} === 'keyframe 2'")
+    page.run(SET.format(".time input", "5"))
+    page.wait(f"{caption} === 'latest keyframe, 4'")
+    one = house.keyframe(5, 25.0)
+    with ScanStore.open(tmp_path / "drone-1/test-1/scan.db") as scan:
+        scan.add_keyframe(5, encode(one, one.time_ns))
+    page.wait("document.querySelector('.time input').value === '6'")  # it follows the flight
+    settle(page)
+    assert page.run(caption) == "latest keyframe, 4"
 
 
 def test_the_slider_of_several_dates_states_dates_in_their_order(

@@ -23,7 +23,7 @@ export interface Site {
 }
 
 /** A slider over the keyframes: all as it was when each was taken, played if one likes; at its end it follows. `moved` is
- * called with each of its moves. */
+ * called with each of its moves, but not while it follows a flight. */
 export function timeSlider({ stage, cloud, cameras }: Site, moved: () => void): { element: HTMLElement; refresh: () => void; toEnd: () => void } {
   const input = el("input", { type: "range", min: "1", value: "1", max: "1" });
   input.setAttribute("aria-label", "time of the flight");
@@ -42,9 +42,9 @@ export function timeSlider({ stage, cloud, cameras }: Site, moved: () => void): 
     shown.value = moment(moments[k]!, moments[0]!, moments.at(-1)!);
     day.textContent = new Date(1000 * moments[k]!).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
     cameras.stand(last ? null : cloud.own.newest);
-    moved();
     stage.touch();
   };
+  const move = (): void => (show(), moved());
   const stop = (): void => {
     clearTimeout(timer);
     timer = 0;
@@ -57,7 +57,7 @@ export function timeSlider({ stage, cloud, cameras }: Site, moved: () => void): 
     timer = setTimeout(
       () => {
         input.value = String(k + 1);
-        show();
+        move();
         step();
       },
       (1000 * Math.min(moments[k]! - moments[k - 1]!, LONGEST_WAIT_S)) / Number(speed.value),
@@ -66,11 +66,11 @@ export function timeSlider({ stage, cloud, cameras }: Site, moved: () => void): 
   play.onclick = () => {
     if (timer) return stop();
     if (input.value === input.max) input.value = "1";
-    show();
+    move();
     [play.textContent, play.title] = ["❚❚", "pause"];
     step();
   };
-  input.oninput = () => (stop(), show());
+  input.oninput = () => (stop(), move());
   const refresh = (): void => {
     const n = cloud.moments().length;
     element.hidden = n < 2;
@@ -84,7 +84,7 @@ export function timeSlider({ stage, cloud, cameras }: Site, moved: () => void): 
     if (input.value === input.max) return;
     input.value = input.max;
     stop();
-    show();
+    move();
   };
   return { element, refresh, toEnd };
 }
