@@ -40,6 +40,7 @@ class State(Enum):
 
     @property
     def is_wanted(self) -> bool:
+        """From start to stop, pauses and retries included."""
         return Event.STOP in TRANSITIONS[self]
 
     @property

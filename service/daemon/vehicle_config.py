@@ -94,6 +94,7 @@ def with_parameter(config: Config, name: str, value: float) -> Config:
 
 
 def parameters_of(config: Config) -> dict[str, float]:
+    """The parameters of a configuration; values that are not representable are left out."""
     found = {}
     for name, tunable in TUNABLES.items():
         section, _, field = tunable.key.partition(".")

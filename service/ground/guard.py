@@ -223,7 +223,7 @@ CLOSE = {"connection": "close"}
 
 
 class _StalledError(Exception):
-    pass
+    """The other end has stopped reading."""
 
 
 class RequestLimits:

@@ -126,6 +126,7 @@ class VehicleOrder(Body):
 
 
 def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
+    """The portal as an ASGI application; ``local`` when only this machine can reach it."""
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),

@@ -90,7 +90,7 @@ FILES: dict[str, str] = {
 
 
 class ConflictError(InputError):
-    pass
+    """Somebody else was faster, or is at it."""
 
 
 class Library:
@@ -185,6 +185,7 @@ class Library:
             yield folder
 
     def delete(self, drone: str, scan: str) -> str:
+        """Move a scan to the bin; the name it has there."""
         with self.changing(drone, scan) as folder:
             name = f"{drone}~{scan}~{time.time_ns()}"
             _move(folder, self.store / BIN / name)

@@ -56,6 +56,7 @@ def mercator(lat_deg: F64, lon_deg: F64) -> F64:
 
 
 def degrees(x: float, y: float) -> tuple[float, float]:
+    """(latitude, longitude) of a place in that square."""
     return math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * y)))), 360.0 * (x - 0.5)
 
 
@@ -74,6 +75,8 @@ class _Drawn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Points:
+    """A keyframe's points, the surest last."""
+
     place: F64  # (N, 2) in the square of Web Mercator
     height_m: F32  # NaN where it is not measured
     sigma_m: F32
@@ -228,6 +231,7 @@ def unmeasured(keyframe: Keyframe, image: bytes) -> PointCloud:
 
 
 def _corner(tile: Tile) -> F64:
+    """(2,) the north-west corner of a tile's margin, in the square of Web Mercator."""
     zoom, x, y = tile
     return (np.array([x, y]) - MARGIN / SIDE) / (1 << zoom)
 

@@ -338,6 +338,7 @@ def state_of(connection: HTTPConnection) -> PortalState:
 
 
 def names_of(connection: HTTPConnection) -> tuple[str, str]:
+    """Drone and scan in the path, unchecked."""
     return connection.path_params["drone"], connection.path_params["scan"]
 
 
