@@ -119,6 +119,7 @@ def boresight(
     each = np.add.reduceat(R_reported @ R_odom.transpose(0, 2, 1), first)
     frames = np.array([se3.nearest_rotation(mean) for mean in each])
     turn, known = np.zeros(3), np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
+    usual = np.full(3, SIGMA_RAD)
     for _ in range(ROUNDS):
         parallel.release_gil()
         Q = R_reported @ se3.so3_exp(turn)
@@ -130,14 +131,16 @@ def boresight(
         A_ww, g_w = np.add.reduceat(info, first) + 1e-9, -np.add.reduceat(info * r, first)
         A_wb = -np.add.reduceat(info[:, :, None] * Q, first)
         gain = A_wb.transpose(0, 2, 1) / A_ww[:, None]
-        before = np.maximum(SIGMA_RAD, np.abs(turn)) ** -2.0  # a large one refutes what is usual
-        H = np.diag(before) + np.einsum("nki,nk,nkj->ij", Q, info, Q)
+        H = np.diag(usual**-2) + np.einsum("nki,nk,nkj->ij", Q, info, Q)
         H = H - np.sum(gain @ A_wb, axis=0)
         g = np.einsum("nki,nk->i", Q, info * r) - np.einsum("fij,fj->i", gain, g_w)
-        step = np.linalg.solve(H, g - turn * before)
+        step = np.linalg.solve(H, g - turn * usual**-2)
         w = (g_w - A_wb @ step) / A_ww
         frames = se3.each_so3_exp(w) @ frames
         turn = turn + step
+        # Only a turn that is sure in spite of what is usual refutes that.
+        refuted = turn**2 > SURE * np.diag(np.linalg.inv(H))
+        usual = np.where(refuted, np.maximum(usual, np.abs(turn)), usual)
         if max(np.abs(step).max(), np.abs(w).max()) < 1e-6:
             break
     if float(np.median(norms)) > WILD or float(np.linalg.norm(turn)) > BOUND_RAD:
