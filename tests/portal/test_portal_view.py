@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
-from loopback import free_port
+from loopback import free_port, until
 from person import Browser, Page
 from portal_client import NEEDS, TOKEN, VEHICLE_SHOWN, browser
 from rehearsal import RehearsalVehicle
@@ -209,9 +209,8 @@ def test_the_surface_is_closed_also_while_it_moves(browser: Browser, portal: Por
     open_scan(browser, portal)
     browser.click("Surface")
     browser.click("Whole site")
-    browser.run("new Promise(r => setTimeout(r, 2000))")  # the ground below follows in its time
+    until(lambda: solid_share(drawn(browser)) > 0.999)  # the ground below follows in its time
     closed = drawn(browser)
-    assert solid_share(closed) > 0.999
     red = closed[closed[..., 2] > 2.0 * closed[..., 1]]  # the roof, in the colour of its images
     assert len(red) > 100 and np.abs(np.median(red, axis=0) - (47, 47, 230)).max() < 25
     browser.click("Measured only")
