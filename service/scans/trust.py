@@ -192,21 +192,20 @@ def _uncertain(sigma_focal: float) -> str:
 
 def _refused(run: Mapping[str, Any], kind: str, why: str) -> tuple[float, float]:
     """Number of readings of a kind that the pose graph left out, and of all."""
-    graph = run.get("graph")
-    graph = graph if isinstance(graph, Mapping) else {}
-    residuals = graph.get("residuals")
-    used = residuals.get(kind) if isinstance(residuals, Mapping) else None
-    refused = _number(graph.get("left_out"), why) or 0.0
-    return refused, refused + (_number(used, "count") or 0.0)
+    refused = _number(_part(run.get("graph"), "left_out"), why) or 0.0
+    return refused, refused + (_number(_residuals(run).get(kind), "count") or 0.0)
 
 
 def _scale_wander(run: Mapping[str, Any]) -> float:
     """How many times further vision's scale changes along the track and over loops than usual, 1 at
     least."""
-    graph = run.get("graph")
-    residuals = graph.get("residuals") if isinstance(graph, Mapping) else None
-    kinds = [residuals.get(k) for k in SCALE_KINDS] if isinstance(residuals, Mapping) else []
-    return max(1.0, *(_number(kind, "rms") or 0.0 for kind in kinds), 0.0)
+    residuals = _residuals(run)
+    return max([1.0, *(_number(residuals.get(kind), "rms") or 0.0 for kind in SCALE_KINDS)])
+
+
+def _residuals(run: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Of the pose graph, by the kind of reading."""
+    return _part(run.get("graph"), "residuals")
 
 
 def scales_differ(gnss_over_heights: float) -> str:
@@ -250,6 +249,11 @@ def _assumed(run: Mapping[str, Any]) -> list[Any]:
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:
     return {"level": level.value, "reasons": reasons}
+
+
+def _part(document: Any, key: str) -> Mapping[str, Any]:
+    part = document.get(key) if isinstance(document, Mapping) else None
+    return part if isinstance(part, Mapping) else {}
 
 
 def _number(document: Any, key: str) -> float | None:

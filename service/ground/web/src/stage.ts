@@ -232,9 +232,10 @@ export class Stage {
   async load(address: string): Promise<() => void> {
     const { scene } = await new GLTFLoader().loadAsync(address);
     scene.rotation.x = Math.PI / 2;
+    const { card } = this;
     scene.traverse((node) => {
       const map = node instanceof THREE.Mesh && (node.material as THREE.MeshStandardMaterial).map;
-      if (map) sharpen(map, this.card);
+      if (map) sharpen(map, card);
     });
     this.model.add(scene);
     this.touch();
