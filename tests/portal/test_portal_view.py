@@ -181,10 +181,10 @@ def is_site(image: U8, sky_of: U8 | None = None) -> Bool:
 
 
 def solid_share(image: U8, sky_of: U8 | None = None) -> float:
-    """Share of the site's inner area where the background does not show through."""
+    """Share of the site's area, without its rim that fades, where no background shows through."""
     shown = is_site(image, sky_of).astype(np.uint8)
     closed = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, np.ones((31, 31)))
-    inner = cv2.erode(closed, np.ones((15, 15))).astype(bool)
+    inner = cv2.erode(closed, np.ones((41, 41))).astype(bool)
     assert inner.mean() > 0.02
     return float(shown[inner].mean())
 
