@@ -136,6 +136,21 @@ def tiles_of(tileset: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any] | N
     yield from below(read(tileset)["root"], None, tileset)
 
 
+TILESET = shutil.which("3d-tiles-validator")
+
+
+@pytest.mark.skipif(TILESET is None, reason="needs 3d-tiles-validator (npm i -g ...)")
+@pytest.mark.parametrize("kind", ["3dtiles", "3dtiles-mesh"])
+def test_cesium_finds_nothing_in_tilesets(scan_dir: Path, tmp_path: Path, kind: str) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
+    tileset, report = written(scan_dir, kind) / "tileset.json", tmp_path / "report.json"
+    assert TILESET is not None
+    names = ["--tilesetFile", str(tileset), "--reportFile", str(report)]
+    subprocess.run([TILESET, *names], check=True, capture_output=True)
+    found = json.loads(report.read_text())
+    assert found["numErrors"] == found["numWarnings"] == 0, found["issues"]
+
+
 @pytest.mark.parametrize("kind", ["3dtiles", "3dtiles-mesh"])
 def test_tilesets_follow_3d_tiles(scan_dir: Path, kind: str) -> None:
     pytest.importorskip("py3dtiles" if kind == "3dtiles" else "open3d", exc_type=ImportError)
