@@ -36,6 +36,7 @@ BOXES: dict[str, tuple[int, int, str]] = {
     "recon/backends": (205, 485, "CPU, torch, ONNX"),
     "recon/types.py": (370, 485, "records, frames, lens"),
     "recon/pipeline": (535, 485, "mapper.py = Figure 1"),
+    "recon/survey": (700, 485, "ground control, sites"),
     "service/sim": (760, 25, "sim, bench, commands"),
 }
 """Room to the corner of its box and what it holds."""

@@ -26,7 +26,7 @@ from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
-from recon.posegraph.submap_loops import points_of
+from recon.survey.submap_loops import points_of
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.bench import BenchOptions, BenchResult
 from service.config import DatalinkConfig

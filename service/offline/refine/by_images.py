@@ -32,7 +32,7 @@ from recon.calibration.global_bundle import Knowledge, Problem, Sightings, dispe
 from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.parallel import run_parallel
-from recon.posegraph.ground_control import Adjusted, KeyframeTrack, Mark, Survey, map_position
+from recon.survey.ground_control import Adjusted, KeyframeTrack, Mark, Survey, map_position
 from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.refine import own_camera

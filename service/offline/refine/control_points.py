@@ -11,8 +11,8 @@ import numpy as np
 from recon import se3
 from recon.calibration.tracks import without_distortion
 from recon.camera_model import project, rays
-from recon.posegraph.ground_control import Mark, consenting, map_position
 from recon.similarity import Similarity, umeyama
+from recon.survey.ground_control import Mark, consenting, map_position
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame

@@ -20,7 +20,9 @@ import numpy as np
 
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.parallel import run_parallel
-from recon.posegraph.ground_control import (
+from recon.posegraph.records import Loop
+from recon.posegraph.sensor_offsets import constants
+from recon.survey.ground_control import (
     SIGMA_SCALE,
     Adjusted,
     KeyframeTrack,
@@ -30,8 +32,6 @@ from recon.posegraph.ground_control import (
     map_position,
     supported,
 )
-from recon.posegraph.records import Loop
-from recon.posegraph.sensor_offsets import constants
 from recon.types import Camera, Keyframe, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cameras.rig import Rig

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.posegraph.ground_control import Adjusted, KeyframeTrack, map_position
+from recon.survey.ground_control import Adjusted, KeyframeTrack, map_position
 from recon.types import F64
 from service.offline.refine.control_points import Candidate
 from service.offline.refine.stored_loops import steps_m

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from recon import se3
-from recon.posegraph.ground_control import Adjusted
+from recon.survey.ground_control import Adjusted
 from recon.types import F64, I64, Keyframe
 from service.cameras.rig import attitude_of
 from service.errors import InputError, OutsideError

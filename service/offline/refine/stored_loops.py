@@ -16,10 +16,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon import se3
-from recon.posegraph.ground_control import KeyframeTrack
 from recon.posegraph.loop_closure import LoopEnd, candidates, ground_seen
 from recon.posegraph.records import Loop
-from recon.posegraph.submap_loops import filled, verify_surfaces
+from recon.survey.ground_control import KeyframeTrack
+from recon.survey.submap_loops import filled, verify_surfaces
 from recon.types import F64, Keyframe
 from service.progress import Progress
 

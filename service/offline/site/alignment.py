@@ -17,14 +17,14 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.ground_control import (
+from recon.posegraph.records import Loop
+from recon.similarity import umeyama
+from recon.survey.ground_control import (
     KeyframeTrack,
     adjust,
     supported,
 )
-from recon.posegraph.records import Loop
-from recon.posegraph.site_alignment import SiteAlignment, Tie, align, alike
-from recon.similarity import umeyama
+from recon.survey.site_alignment import SiteAlignment, Tie, align, alike
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of

@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.posegraph.submap_loops import points_of
 from recon.surface.change import (
     Body,
     Change,
@@ -27,6 +26,7 @@ from recon.surface.change import (
 )
 from recon.surface.ground import ground_cells
 from recon.surface.raster import Grid, Raster
+from recon.survey.submap_loops import points_of
 from recon.types import F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from recon import se3
-from recon.posegraph.ground_control import supported
 from recon.posegraph.records import Loop
-from recon.posegraph.site_alignment import align, alike
 from recon.similarity import Similarity
+from recon.survey.ground_control import supported
+from recon.survey.site_alignment import align, alike
 from recon.types import F64, Keyframe
 from service.errors import InputError, SkyreliefError
 from service.georeference import LocalFrame, between_frames

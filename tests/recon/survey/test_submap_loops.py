@@ -10,10 +10,10 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.ground_control import KeyframeTrack, adjust, supported
 from recon.posegraph.loop_closure import LoopEnd
 from recon.posegraph.records import Loop
-from recon.posegraph.submap_loops import filled, verify_surfaces
+from recon.survey.ground_control import KeyframeTrack, adjust, supported
+from recon.survey.submap_loops import filled, verify_surfaces
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.offline.refine.stored_loops import steps_m, stored_loops
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.site_alignment import (
+from recon.similarity import Similarity
+from recon.survey.site_alignment import (
     SiteAlignment,
     Tie,
     align,
     alike,
 )
-from recon.similarity import Similarity
 from recon.types import F64
 
 SIGMA = np.array([0.005] * 3 + [1.0, 1.0, 1.5, 0.005])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph import ground_control
-from recon.posegraph.ground_control import KeyframeTrack, Mark, adjust, map_position
 from recon.posegraph.records import Loop
 from recon.posegraph.smoother import State
 from recon.similarity import umeyama
+from recon.survey import ground_control
+from recon.survey.ground_control import KeyframeTrack, Mark, adjust, map_position
 from recon.types import F64, PosePrior
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
