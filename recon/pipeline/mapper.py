@@ -17,6 +17,7 @@ import numpy as np
 
 from recon.backends import Backend, DenseStages
 from recon.backends.cpu import CpuBackend
+from recon.calibration.adjusted_track import AdjustedTrack
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.mapping.voxel_map import VoxelMap, ground_sample_m
@@ -40,7 +41,6 @@ from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
-from recon.tracking.adjusted_track import AdjustedTrack
 from recon.tracking.frame import CONTRADICTED, NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
 from recon.types import U8, Array, Camera, DepthMap, Keyframe, PointCloud, Pose, PosePrior

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
+from recon.calibration.adjusted_track import AnyTrack
 from recon.camera_model import Undistorter
 from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import NEAR_S, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.posed_image import PosedImage
-from recon.tracking.adjusted_track import AnyTrack
 from recon.tracking.frame import NO_IMAGE, TWO_ONLY, Frame, Tracking
 from recon.tracking.keyframe_window import landmark_points, median_depth, step_covariance
 from recon.tracking.prediction import inverse_depth_plane

@@ -16,6 +16,7 @@ import numpy as np
 
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import LatencyEstimate
+from recon.calibration.adjusted_track import AdjustedTrack, adjusted_still
 from recon.calibration.global_bundle import Knowledge
 from recon.calibration.joint_adjustment import JointAdjustment, Turning, adjust_jointly
 from recon.calibration.tracks import pieces
@@ -23,7 +24,6 @@ from recon.camera_model import scaled
 from recon.parallel import limit_threads
 from recon.pipeline.mapper import Mapper
 from recon.rolling_shutter import RowClock, Rows
-from recon.tracking.adjusted_track import AdjustedTrack, adjusted_still
 from recon.tracking.frame import Frame, Landmarks
 from recon.types import F64, U8, Camera, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter

@@ -209,8 +209,8 @@ def fly(
     What came before that is wrong, so such a scan is discarded, unless it goes to the ground.
     """
     from service.commands.missing_metadata import correction_of
+    from service.daemon.datalink import open_datalink
     from service.daemon.warm_up import has_kernels, load_kernels
-    from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, create_store
     from service.memory import release_memory
     from service.scans.folder import write_deliverables

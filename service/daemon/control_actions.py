@@ -89,7 +89,7 @@ class ControlActions:
         camera = self._scanning.camera
         if camera is None or not self.is_ready:
             return CameraView()
-        from service.flight.vehicle_reports import camera_view
+        from service.daemon.vehicle_reports import camera_view
 
         history, now_ns = self._scanning.vehicle.history, time.monotonic_ns()
         states = (history.state_at(now_ns - age_ns, waits=False) for age_ns in VIEW_AGES_NS)

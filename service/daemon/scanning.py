@@ -26,6 +26,7 @@ from mavlink.component.status import CRITICAL, WARNING
 from mavlink.component.vehicle import VehicleLink
 from mavlink.telemetry.clock import agree, computer_offset_ns
 from service.config import Config, change
+from service.daemon.datalink import DaemonLink
 from service.daemon.load_shedding import GRACE_S, Level, MachineReadings, lowered
 from service.daemon.resumption import Resumption
 from service.daemon.scan_state import (
@@ -38,7 +39,6 @@ from service.daemon.scan_state import (
 )
 from service.daemon.warm_up import is_warm
 from service.errors import InputError, OutsideError, SkyreliefError
-from service.flight.datalink import DaemonLink
 from service.memory import release_memory
 from service.scans.retention import Claim
 from service.workers import PROCESS, Worker, Workers, guarded
@@ -503,8 +503,8 @@ class Scanning:
         from service.cameras.lens import fitted
         from service.daemon.camera_memory import measured
         from service.daemon.frame_gate import FrameGate
+        from service.daemon.vehicle_reports import OdometryReport
         from service.flight.scan import ScanInputs
-        from service.flight.vehicle_reports import OdometryReport
 
         vehicle, config, backend = self.vehicle, self.config, self.backend
         assert self.camera is not None and backend is not None
@@ -623,7 +623,7 @@ def _report(
     scan: Scan, time_ns: int, R_world_camera: F64 | None, position_m: F64 | None,
     agl_m: float | None, file: str = "",
 ) -> KeyframeReport:  # fmt: skip
-    from service.flight.vehicle_reports import keyframe_report
+    from service.daemon.vehicle_reports import keyframe_report
 
     unix_ns, frame = time_ns + scan.inputs.unix_offset_ns, scan.rig.local_frame
     return keyframe_report(unix_ns, R_world_camera, position_m, frame, agl_m, file)

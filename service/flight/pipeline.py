@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 
 from recon.backends import Backend
+from recon.calibration.adjusted_track import AdjustedTrack
 from recon.parallel import limit_threads
 from recon.pipeline.mapper import Mapper, MapperConfig, Reconstruct, Reconstructed
 from recon.pipeline.views import StereoView
-from recon.tracking.adjusted_track import AdjustedTrack
 from recon.types import Camera
 from service.background import BackgroundWorker
 from service.cameras.camera_file import seeks_readout, with_shutter

@@ -19,10 +19,10 @@ from typing import Any
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
+from recon.calibration.adjusted_track import AdjustedTrack
 from recon.pipeline.mapper import Event as MapperEvent
 from recon.pipeline.mapper import FramePosed
 from recon.posegraph.pose_priors import VelocityIntegrator
-from recon.tracking.adjusted_track import AdjustedTrack
 from recon.tracking.frame import Frame
 from recon.types import Camera, Keyframe, Pose, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter

@@ -15,6 +15,7 @@ from some_views import view_at
 
 import recon
 from recon import se3
+from recon.calibration.adjusted_track import AdjustedTrack
 from recon.pipeline.mapper import (
     FramePosed,
     KeyframeReady,
@@ -24,7 +25,6 @@ from recon.pipeline.mapper import (
     moved,
 )
 from recon.pipeline.views import StereoView, ViewSelection
-from recon.tracking.adjusted_track import AdjustedTrack
 from recon.tracking.frame import Frame, Tracking
 from recon.types import Camera, DepthMap, Keyframe, Pose, PosePrior
 

@@ -16,7 +16,7 @@ from rehearsal import RehearsalControl
 from mavlink.component.control import NoScans
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
-from service.flight.datalink import DaemonLink, open_backlog
+from service.daemon.datalink import DaemonLink, open_backlog
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.link import DatalinkSender, LinkProgress
 from service.stream.records import PoseRecord, ScanHeader

@@ -25,7 +25,7 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.config import Config, DatalinkConfig
-from service.flight.datalink import OWN_LINKS, DaemonLink
+from service.daemon.datalink import OWN_LINKS, DaemonLink
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.radio import DRONE, GROUND, TUNNEL, RadioLink
 from service.stream import codec

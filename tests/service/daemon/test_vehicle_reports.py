@@ -26,7 +26,7 @@ from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Camera, Pose
 from service.config import CameraConfig, load_config
 from service.daemon.runtime import Daemon
-from service.flight.vehicle_reports import OdometryReport, camera_view
+from service.daemon.vehicle_reports import OdometryReport, camera_view
 
 S = 1_000_000_000
 BODY = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])  # q_ned_body
