@@ -59,16 +59,13 @@ MIN_WALK = 0.02  # sigma that no integrated velocity is better than, m / sqrt(s)
 
 def fit(
     nodes: Sequence[Node],
-    fix_s: float = FIX_S,
-    attitude_s: float = ATTITUDE_S,
     slow_share: float = 1.0,
     usual: ReadingNoise | None = None,
 ) -> Alignment | None:
     """The similarity that brings the nodes onto their priors, or None without any prior.
 
-    The nodes stand in the order of time; ``fix_s`` and ``attitude_s`` are the usual time
-    constants with which a receiver and assumed views wander. How fixes and velocities err is
-    measured by their residuals against the track of a first fit and weighs them in a second one.
+    The nodes stand in the order of time. How fixes and velocities err is measured by their
+    residuals against the track of a first fit and weighs them in a second one.
     An assumed height takes part only where nothing else measures the scale as well.
     An assumed view is off by one angle in all images, and altitudes of no stated accuracy drift:
     both are fitted too. Where fixes differ by more than their noise, the covariance grows by as
@@ -79,21 +76,19 @@ def fit(
     usable = [a for a in nodes if a.prior.R_world_camera is not None or has_fix(a.prior)]
     if not usable:
         return None
-    bias_tau_s = (fix_s, attitude_s)
-    readings = AlignmentReadings(usable, bias_tau_s=bias_tau_s)
+    readings = AlignmentReadings(usable)
     if _velocities_contradict(readings):
         usable = [replace(a, prior=replace(a.prior, travel=None)) for a in usable]
-        readings = AlignmentReadings(usable, bias_tau_s=bias_tau_s)
+        readings = AlignmentReadings(usable)
     starts = _starts(usable, readings)
     found = [_solve(readings, start, SETTLED_START) for start in starts]
     best = min(found, key=lambda f: f.cost)
-    noise = _measured(usable, best.at, bias_tau_s, slow_share)
-    noise = noise.or_else(usual, readings.claimed)
-    readings = AlignmentReadings(usable, noise, bias_tau_s)
+    noise = _measured(usable, best.at, slow_share).or_else(usual, readings.claimed)
+    readings = AlignmentReadings(usable, noise)
     best = _solve(readings, best.at, SETTLED)
     covariance = _covariance(readings, best)
     if readings.is_height_assumed:
-        others = AlignmentReadings([replace(a, height=None) for a in usable], noise, bias_tau_s)
+        others = AlignmentReadings([replace(a, height=None) for a in usable], noise)
         measured = _solve(others, best.at, SETTLED)
         known = _covariance(others, measured)
         if known[6, 6] < GUESSED_SHARE**2:  # the assumed height would pull the scale
@@ -108,8 +103,7 @@ def fit(
     if len(readings.fix):
         claimed = readings.claimed * noise.over_claim
         covariance[3:6, 3:6] += np.diag(np.mean(np.square(claimed), axis=0))
-    if len(readings.fix) and fix_s > 0:
-        mean, counted = noise.of_mean(readings.claimed, readings.fix_s, fix_s)
+        mean, counted = noise.of_mean(readings.claimed, readings.fix_s)
     similarity = replace(
         best.at, covariance=covariance, sources=_sources(readings), noise=noise, sigma_fixes=mean,
         sigma_counted=counted, span_s=readings.span_s, heights=heights,
@@ -130,9 +124,7 @@ def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
     return np.asarray(np.linalg.inv(found.H)[:7, :7] * max(found.excess, 1.0), np.float64)
 
 
-def _measured(
-    nodes: Sequence[Node], start: Alignment, bias_tau_s: tuple[float, float], slow_share: float
-) -> ReadingNoise:
+def _measured(nodes: Sequence[Node], start: Alignment, slow_share: float) -> ReadingNoise:
     """The noise of fixes and of velocities, each estimated from residuals against a fit of that
     sensor and the attitudes' tilt alone: a compass that is off would look like a drift."""
     level = [
@@ -140,17 +132,17 @@ def _measured(
     ]
     fixed = [replace(a, prior=replace(a.prior, travel=None)) for a in level]
     moved = [replace(a, prior=replace(a.prior, position_m=None)) for a in level]
-    out, at, fixes = ReadingNoise(), start, AlignmentReadings(fixed, None, bias_tau_s)
+    out, at, fixes = ReadingNoise(), start, AlignmentReadings(fixed)
     # Altitudes that weigh too little leave a lean, which looks like a wander of theirs. So they
     # begin as if they were as good as places.
     if not fixes.is_height_claimed and len(fixes.fix):
-        alike = Noise(float(np.median(fixes.claimed[:, :2])), 0.0, max(bias_tau_s[0], 1.0))
-        fixes = AlignmentReadings(fixed, ReadingNoise(apart=(alike, alike)), bias_tau_s)
+        alike = Noise(float(np.median(fixes.claimed[:, :2])), 0.0, FIX_S)
+        fixes = AlignmentReadings(fixed, ReadingNoise(apart=(alike, alike)))
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
         at = _solve(fixes, at, SETTLED_START).at
-        out = _of_fixes(fixes, at, bias_tau_s, slow_share)
-        fixes = AlignmentReadings(fixed, out, bias_tau_s)
-    ways = AlignmentReadings(moved, None, bias_tau_s)
+        out = _of_fixes(fixes, at, slow_share)
+        fixes = AlignmentReadings(fixed, out)
+    ways = AlignmentReadings(moved)
     if len(ways.way) >= MIN_READINGS:
         drift = ways.moved(_solve(ways, start, SETTLED_START).at)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
@@ -162,29 +154,26 @@ def _measured(
     return out
 
 
-def _of_fixes(
-    fixes: AlignmentReadings, at: Alignment, bias_tau_s: tuple[float, float], slow_share: float
-) -> ReadingNoise:
+def _of_fixes(fixes: AlignmentReadings, at: Alignment, slow_share: float) -> ReadingNoise:
     """The noise of fixes and of assumed views, by their residuals to a track.
 
     A slow difference may be vision's own drift, so a wander is bounded by what the sensor claims;
     its white part is not. Altitudes whose accuracy nothing states wander as they are seen to, and
     by a share of their drift: none is steady.
     """
-    fix_s, attitude_s = bias_tau_s
     if len(fixes.fix) < MIN_READINGS:
         return ReadingNoise()
     tilts = fixes.turned(at)[0][fixes.is_assumed, :2]
-    tilt = gauss_markov_noise(fixes.tilt_s, tilts, attitude_s, 1.0)
+    tilt = gauss_markov_noise(fixes.tilt_s, tilts, ATTITUDE_S, 1.0)
     if tilt is not None:
         tilt = tilt.scattered(tilts).bounded(
-            ASSUMED_TILT_RAD, attitude_s, MIN_BIAS * ASSUMED_TILT_RAD
+            ASSUMED_TILT_RAD, ATTITUDE_S, MIN_BIAS * ASSUMED_TILT_RAD
         )
     apart, is_claimed = fixes.placed(at), fixes.is_height_claimed
-    flat_off, high_off = (gauss_markov_noise(fixes.fix_s, apart[:, k], fix_s, 1.0) for k in AXES)
-    across = gauss_markov_noise(fixes.fix_s, apart[:, :2], fix_s)
+    flat_off, high_off = (gauss_markov_noise(fixes.fix_s, apart[:, k], FIX_S, 1.0) for k in AXES)
+    across = gauss_markov_noise(fixes.fix_s, apart[:, :2], FIX_S)
     along = gauss_markov_noise(
-        fixes.fix_s, apart[:, 2:], fix_s, SURE_OF_BIAS if is_claimed else 1.0
+        fixes.fix_s, apart[:, 2:], FIX_S, SURE_OF_BIAS if is_claimed else 1.0
     )
     if across is None or along is None or flat_off is None or high_off is None:
         return ReadingNoise(tilt=tilt)
@@ -194,7 +183,7 @@ def _of_fixes(
     least = 1.0 if is_claimed else MIN_BIAS
     reach = across.reach(flat, min(least, slow_share))
     most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift_m)
-    flat_s, high_s = bias_time_constant_s(most, fix_s), bias_time_constant_s(high, fix_s)
+    flat_s, high_s = bias_time_constant_s(most), bias_time_constant_s(high)
     vertical = along.bounded(high, high_s, MIN_BIAS * drift)
     return ReadingNoise(
         horizontal=across.bounded(most, flat_s, MIN_BIAS * most),

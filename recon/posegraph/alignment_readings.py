@@ -61,18 +61,15 @@ class ReadingNoise:
             return None
         return self.horizontal, self.horizontal, self.vertical
 
-    def of_fixes(self, claimed: F64, fix_s: float) -> tuple[F64, tuple[Noise, Noise]]:
+    def of_fixes(self, claimed: F64) -> tuple[F64, tuple[Noise, Noise]]:
         """(m, 3) sigma of a fix alone, and how such errors, in units of it, go along the track:
         horizontal and vertical."""
         if self.apart is not None:
             across, along = (replace(n, white=max(n.white, MIN_FIX_M)) for n in self.apart)
             single = np.full_like(claimed, [across.total, across.total, along.total])
             return single, (across.in_units_of(across.total), along.in_units_of(along.total))
-        tau_s = (
-            bias_time_constant_s(float(np.median(claimed[:, 0])), fix_s) if len(claimed) else fix_s
-        )
-        common = (BIAS_SHARE**-2 - 1.0) ** 0.5 if fix_s > 0 else 0.0
-        usual = Noise(1.0, common, max(tau_s, 1.0))
+        tau_s = bias_time_constant_s(float(np.median(claimed[:, 0]))) if len(claimed) else FIX_S
+        usual = Noise(1.0, (BIAS_SHARE**-2 - 1.0) ** 0.5, tau_s)
         return BIAS_SHARE * claimed, (usual, usual)
 
     def or_else(self, usual: ReadingNoise | None, claimed: F64) -> ReadingNoise:
@@ -86,19 +83,19 @@ class ReadingNoise:
         walk, rate = self.walk_m_per_sqrt_s, self.rate_m_s
         return replace(usual, tilt=tilt, walk_m_per_sqrt_s=walk, rate_m_s=rate)
 
-    def of_tilts(self, claimed: F64, times_s: F64, attitude_s: float) -> F64:
+    def of_tilts(self, claimed: F64, times_s: F64) -> F64:
         """(n, 2) sigma with which assumed views weigh, of (n, 2) claimed ones at (n,) times."""
         span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
         if self.tilt is None:
-            return np.asarray(claimed * inflation(len(claimed), span_s, attitude_s))
+            return np.asarray(claimed * inflation(len(claimed), span_s, ATTITUDE_S))
         return np.full_like(claimed, self.tilt.effective_sigma(len(claimed), span_s))
 
-    def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
+    def of_mean(self, claimed: F64, times_s: F64) -> tuple[F64, F64]:
         """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
         the readings in a graph count for it."""
         usual, count, span_s = np.median(claimed, axis=0), len(claimed), float(np.ptp(times_s))
         if (known := self.by_axis) is None or self.reach_m is None:
-            return usual, usual / np.sqrt(1.0 + span_s / (2.0 * fix_s))
+            return usual, usual / np.sqrt(1.0 + span_s / (2.0 * FIX_S))
         far = zip(known, self.reach_m, count * self.fresh_share, strict=True)
         mean = [one.of_mean(float(m), float(n), span_s) for one, m, n in far]
         counted = [one.effective_sigma(count, span_s) / count**0.5 for one in known]
@@ -148,17 +145,12 @@ class Alignment(Similarity):
 class AlignmentReadings:
     """The nodes' readings as arrays, by kind; rows of one reading form a group."""
 
-    def __init__(
-        self,
-        nodes: Sequence[Node],
-        noise: ReadingNoise | None = None,
-        bias_tau_s: tuple[float, float] = (FIX_S, ATTITUDE_S),
-    ) -> None:
+    def __init__(self, nodes: Sequence[Node], noise: ReadingNoise | None = None) -> None:
         turned = [a for a in nodes if a.prior.R_world_camera is not None]
         fixed = [a for a in nodes if has_fix(a.prior)]
         moved = [(a, b, w) for a, b in pairwise(nodes) if (w := _way(a.prior, b.prior))]
         heights, independent = height_ratios(nodes)
-        noise, (fix_s, attitude_s) = noise or ReadingNoise(), bias_tau_s
+        noise = noise or ReadingNoise()
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
         self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
         self.is_assumed = np.array([a.prior.is_view_assumed for a in turned], bool)
@@ -170,16 +162,16 @@ class AlignmentReadings:
         known_s = [a.time_s for a in turned if not a.prior.is_view_assumed]
         self.claimed_tilt = self.sigma_turn[~self.is_assumed, 0].copy()
         span_s = float(np.ptp(known_s)) if known_s else 0.0
-        self.sigma_turn[~self.is_assumed] *= inflation(len(known_s), span_s, attitude_s)
+        self.sigma_turn[~self.is_assumed] *= inflation(len(known_s), span_s, ATTITUDE_S)
         self.sigma_turn[self.is_assumed, :2] = noise.of_tilts(
-            self.sigma_turn[self.is_assumed, :2], self.tilt_s, attitude_s
+            self.sigma_turn[self.is_assumed, :2], self.tilt_s
         )
         self.x = _stack([a.place_of_fix for a in fixed], (3,))  # in the odometry
         self.fix = _stack([a.prior.position_m for a in fixed], (3,))  # in the world
         self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.fix_s = _stack([a.time_s for a in fixed], ())
         self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
-        self.sigma_fix, self.bias = noise.of_fixes(self.claimed, fix_s)
+        self.sigma_fix, self.bias = noise.of_fixes(self.claimed)
         self.step = _stack([b.place - a.place for a, b, _ in moved], (3,))  # by vision
         self.way = _stack([metres for *_, (metres, _) in moved], (3,))  # the same by velocity
         self.way_s = np.maximum(_stack([s for *_, (_, s) in moved], ()), MIN_WAY_S)

@@ -18,7 +18,7 @@ from recon.posegraph.ground import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_attitudes
 from recon.posegraph.records import FRAME_DRIFT, SIGMA_STEP, Loop, Node
 from recon.posegraph.segments import Segments
-from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
+from recon.posegraph.sensor_noise import ALTITUDE_S, ATTITUDE_S, bias_time_constant_s, inflation
 from recon.posegraph.sensor_offsets import FRAME_SIGMA_RAD, GATE_SIGMAS
 from recon.posegraph.smoother import NO_SCALE, Smoother
 from recon.types import F64, PosePrior
@@ -53,12 +53,9 @@ and for each second: about what a drone's speed changes by."""
 class GraphFactors:
     """One build of the graph: the factors of its nodes and loops, and their solution."""
 
-    def __init__(
-        self, segments: Segments, nodes: Collection[Node], bias_tau_s: tuple[float, float, float]
-    ) -> None:
+    def __init__(self, segments: Segments, nodes: Collection[Node]) -> None:
         """How many readings share a sensor's bias follows from the ``nodes`` known so far."""
         self._segments = segments
-        self._fix_s, self._attitude_s, self._altitude_s = bias_tau_s
         self.smoother = Smoother()
         times_ns = [node.time_ns for node in nodes]
         self._keyframes = max(len(times_ns), 1)
@@ -245,7 +242,7 @@ class GraphFactors:
             self.left_out["view off" if prior.is_view_assumed else "tilt off"] += 1
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
-        sigma = sigma * self._inflation(self._attitude_s)
+        sigma = sigma * self._inflation(ATTITUDE_S)
         self.smoother.add_turn("attitude", node.key, R, sigma, HUBER_SIGMAS)
         return True
 
@@ -265,8 +262,7 @@ class GraphFactors:
             each = [one.effective_sigma(self._keyframes, self._span_s) for one in known]
             sigma = np.maximum(each, MIN_FIX_M)
         else:
-            tau_s = bias_time_constant_s(float(sigma[0]), self._fix_s)
-            sigma = sigma * self._inflation(tau_s)
+            sigma = sigma * self._inflation(bias_time_constant_s(float(sigma[0])))
         self.smoother.add_place("position", node.key, prior.position_m, sigma, HUBER_SIGMAS)
         return True
 
@@ -283,7 +279,7 @@ class GraphFactors:
             self.left_out["altitude off"] += 1
             self._altitude_offset_m = prior.altitude_m - T[2, 3]
             return False
-        sigma = np.array([np.inf, np.inf, one * self._inflation(self._altitude_s)])
+        sigma = np.array([np.inf, np.inf, one * self._inflation(ALTITUDE_S)])
         place = np.array([0.0, 0.0, z])
         self.smoother.add_place("altitude", node.key, place, sigma, HUBER_SIGMAS)
         return True

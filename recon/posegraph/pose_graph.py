@@ -16,7 +16,6 @@ from recon.posegraph.factors import GraphFactors
 from recon.posegraph.pose_priors import is_frozen, sound
 from recon.posegraph.records import LOOP_WINDOW, Loop, Node, loops_agree
 from recon.posegraph.segments import Segments
-from recon.posegraph.sensor_noise import BIAS_TAU_S
 from recon.posegraph.sensor_offsets import Constants
 from recon.posegraph.smoother import MANY_STEPS, STEPS, reversed_motion
 from recon.posegraph.thinning import GONE_SHARE, moved_loops, thin
@@ -41,18 +40,15 @@ class PoseGraph:
     use this package's conventions (left perturbations).
     """
 
-    def __init__(
-        self, max_nodes: int = 100_000, bias_tau_s: tuple[float, float, float] = BIAS_TAU_S
-    ) -> None:
-        """Of more than ``max_nodes`` keyframes some are interpolated; the sensors' errors wander
-        with the time constants ``bias_tau_s`` of fixes, attitudes and altitudes, 0 for none."""
-        self.max_nodes, self._bias_tau_s = max_nodes, bias_tau_s
+    def __init__(self, max_nodes: int = 100_000) -> None:
+        """Of more than ``max_nodes`` keyframes some are interpolated."""
+        self.max_nodes = max_nodes
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time
         self._thin_at = max_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
-        self.segments = Segments(bias_tau_s)
+        self.segments = Segments()
         self.loops: list[Loop] = []
         self.pending: list[Loop] = []
         self._built = 0
@@ -231,7 +227,7 @@ class PoseGraph:
 
     def _start(self) -> None:
         self._built += 1
-        self._factors = GraphFactors(self.segments, self._nodes.values(), self._bias_tau_s)
+        self._factors = GraphFactors(self.segments, self._nodes.values())
         self._smoother = self._factors.smoother
 
     def rebuild(self) -> None:

@@ -14,7 +14,6 @@ from recon.posegraph.alignment import Scale
 from recon.posegraph.alignment_readings import Alignment, ReadingNoise
 from recon.posegraph.ground import GUESSED_SHARE, guessed_at
 from recon.posegraph.records import Loop, Node
-from recon.posegraph.sensor_noise import BIAS_TAU_S
 from recon.posegraph.sensor_offsets import Constants, constants, with_offsets
 from recon.types import F64, PosePrior
 
@@ -123,10 +122,8 @@ class Segment:
 class Segments:
     """The segments of one flight, by number; each begins when it is asked for first."""
 
-    def __init__(self, bias_tau_s: tuple[float, float, float] = BIAS_TAU_S) -> None:
-        """``bias_tau_s`` as :data:`recon.posegraph.sensor_noise.BIAS_TAU_S`."""
+    def __init__(self) -> None:
         self._all: dict[int, Segment] = {}
-        self._bias_tau_s = bias_tau_s[:2]
 
     def __getitem__(self, number: int) -> Segment:
         if number not in self._all:
@@ -265,8 +262,7 @@ class Segments:
         segment.fitted = segment.keyframes
         fresh = self._newest_constants()
         readings = self._without_constants(segment, fresh)
-        found = alignment.fit(readings, *self._bias_tau_s, slow_share=fresh.slow_share,
-                              usual=self._usual_noise())  # fmt: skip
+        found = alignment.fit(readings, fresh.slow_share, self._usual_noise())
         if found is None:
             return False
         found = replace(found, bend_rad=_bend_rad(segment.nodes))
@@ -291,7 +287,7 @@ class Segments:
             ([n.T_odom_camera for n in segment.nodes], [n.prior for n in segment.nodes])
             for segment in self
         ]
-        return constants(stretches, span_s, *self._bias_tau_s)
+        return constants(stretches, span_s)
 
     def altitude_offset(self) -> float | None:
         """Altitude less world z over the keyframes that fixes place, else over those of the first

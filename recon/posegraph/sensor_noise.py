@@ -16,7 +16,7 @@ from recon.types import F64
 
 MIN_READINGS = 12  # readings from which on their scatter is measured
 
-BIAS_TAU_S = FIX_S, ATTITUDE_S, ALTITUDE_S = 60.0, 40.0, 120.0
+FIX_S, ATTITUDE_S, ALTITUDE_S = 60.0, 40.0, 120.0
 """Usual time constants with which a receiver's error wanders, an attitude's and a barometer's."""
 
 TAUS_S = (2.0, 5.0, 10.0, 20.0, 40.0)  # time constants that are tried
@@ -93,7 +93,7 @@ class Noise:
         is always there. What was measured beyond the claim is vision's own drift. In both cases
         the time constant is not the sensor's, and the usual one stands in for it.
         """
-        if least <= self.bias <= claimed or usual_tau_s <= 0:
+        if least <= self.bias <= claimed:
             return self
         return replace(self, bias=min(max(self.bias, least), claimed), tau_s=usual_tau_s)
 
@@ -116,8 +116,6 @@ class Noise:
         Over a track without turns it looks like another scale, so no residual shows it. The bias
         is at most as ``claimed``.
         """
-        if tau_s <= 0:
-            return self
         bias = min(self.bias, claimed)
         spans = span_s / tau_s
         # Variance of the slope of a Gauss-Markov error: spans / 5 if short, 2 / spans if long.
@@ -162,9 +160,7 @@ class Noise:
 
 def inflation(count: int, span_s: float, tau_s: float) -> float:
     """Factor on the sigmas of so many readings, whose errors wander with a time constant, as if all
-    were independent; 1 where none wanders."""
-    if tau_s <= 0:
-        return 1.0
+    were independent."""
     return float(np.sqrt(max(1.0, count / (1.0 + span_s / (2.0 * tau_s)))))
 
 
@@ -177,24 +173,24 @@ def fresh_shares(errors: F64) -> F64:
     return np.asarray((1.0 - alike) / (1.0 + alike))
 
 
-def bias_time_constant_s(sigma_m: float, usual_s: float) -> float:
-    """The time constant of a receiver that claims ``sigma_m``; 0 where none wanders."""
-    return min(PRECISE_TAU_S, usual_s) if sigma_m < PRECISE_M else usual_s
+def bias_time_constant_s(sigma_m: float) -> float:
+    """The time constant of a receiver that claims ``sigma_m``."""
+    return PRECISE_TAU_S if sigma_m < PRECISE_M else FIX_S
 
 
 def gauss_markov_noise(
     times_s: F64, residuals: F64, usual_tau_s: float, sure: float = SURE_OF_BIAS
 ) -> Noise | None:
     """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.
-    ``usual_tau_s`` is the time constant of a bias too slow to be measured; 0: none wanders."""
+    ``usual_tau_s`` is the time constant of a bias too slow to be measured."""
     lag, change = variogram(times_s, residuals)
     if len(lag) < 3:
         return None
     two = np.full(len(lag), 2.0)
     (white,), least = _fit_variogram(lag, change, two)
-    best = Noise(float(np.sqrt(white)), 0.0, max(usual_tau_s, 1.0))
+    best = Noise(float(np.sqrt(white)), 0.0, usual_tau_s)
     shorter = [tau for tau in TAUS_S if tau <= lag[-1] / TAUS_SEEN]
-    for tau_s in [usual_tau_s, *shorter] if usual_tau_s > 0 else []:
+    for tau_s in [usual_tau_s, *shorter]:
         parts, error = _fit_variogram(lag, change, two, 2.0 * (1.0 - np.exp(-lag / tau_s)))
         if parts[1] > 0.0 and sure * error <= least:
             # Means and filtered positions change less over short lags: as if white^2 < 0.

@@ -97,9 +97,7 @@ def turns_of(poses: Sequence[F64], priors: Sequence[PosePrior]) -> Turns | None:
     return odom, reported, sigma
 
 
-def boresight(
-    stretches: Sequence[Turns], span_s: float, bias_tau_s: float = ATTITUDE_S
-) -> Constants:
+def boresight(stretches: Sequence[Turns], span_s: float) -> Constants:
     """The boresight by all stretches of a flight of ``span_s``; small where turns are missing.
 
     Vision and telemetry differ by one rotation in the world (the odometry's frame) and one in the
@@ -107,15 +105,15 @@ def boresight(
     doi:10.1109/70.326576). About the vertical they stay one as long as the camera only turns about
     it: a boresight in heading is then a compass error, which the track of the fixes takes out.
 
-    Attitudes err together over ``bias_tau_s``, so all of them count as
-    1 + span / (2 bias_tau_s) readings.
+    Attitudes err together over :data:`ATTITUDE_S`, so all of them count as
+    1 + span / (2 ATTITUDE_S) readings.
     """
     if not stretches:
         return Constants()
     R_odom, R_reported, sigma = (np.concatenate(c) for c in zip(*stretches, strict=True))
     counts = [len(R) for R, *_ in stretches]
     of, first = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts[:-1]])
-    share = min(1.0, (1.0 + span_s / (2.0 * max(bias_tau_s, 1e-3))) / len(of))
+    share = min(1.0, (1.0 + span_s / (2.0 * ATTITUDE_S)) / len(of))
     each = np.add.reduceat(R_reported @ R_odom.transpose(0, 2, 1), first)
     frames = np.array([se3.nearest_rotation(mean) for mean in each])
     turn, known = np.zeros(3), np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
@@ -155,9 +153,7 @@ BY_CHANCE = 2.6  # the variance of four means exceeds the true one by more in on
 WILD_STEPS = 36.0  # squared steps between fixes, over their median, beyond which they are jumps
 
 
-def altitude_datum(
-    priors: Sequence[PosePrior], span_s: float, bias_tau_s: float = FIX_S
-) -> Constants:
+def altitude_datum(priors: Sequence[PosePrior], span_s: float) -> Constants:
     """The datum by all fixes of a flight of ``span_s``, in the order of time.
 
     An autopilot's altitude follows its barometer, whose zero is off by decimetres to metres. The
@@ -166,8 +162,6 @@ def altitude_datum(
     Gauss-Markov, as in :mod:`recon.posegraph.factors`) and stays. The autopilot's altitude rests
     on the same receiver, so the receiver's mean is taken over only as far as it is the better one.
     Where the scatter could be all of the sigma, it is taken to be, but for what is seen to wander.
-
-    ``bias_tau_s`` is the time constant of a receiver's bias.
     """
     rows = [
         (p.gnss_minus_baro_m, p.gnss_minus_baro_fixes, p.sigma_position_m[2])
@@ -190,7 +184,7 @@ def altitude_datum(
     seen = min(_wandered(above[near], fixes[near], white), sigma**2)
     slow = max(sigma**2 - doubt * white**2, seen, (STEADY_SHARE * sigma) ** 2)
     slow_share = min(slow / sigma**2, 1.0)
-    slow /= 1.0 + max(span_s, 0.0) / (2.0 * max(bias_tau_s, 1e-3))
+    slow /= 1.0 + max(span_s, 0.0) / (2.0 * FIX_S)
     left = slow + white**2 / float(fixes[near].sum())
     share = max(0.0, 1.0 - 2.0 * left / sigma**2)
     left_m = float(np.sqrt(left)) if share > 0 else sigma
@@ -223,17 +217,13 @@ NEAR_SIGMAS = 5.0  # fixes further from the track, attitudes from their median, 
 
 
 def constants(
-    stretches: Sequence[tuple[Sequence[F64], Sequence[PosePrior]]],
-    span_s: float,
-    fix_s: float = FIX_S,
-    attitude_s: float = ATTITUDE_S,
+    stretches: Sequence[tuple[Sequence[F64], Sequence[PosePrior]]], span_s: float
 ) -> Constants:
-    """Those of a flight of ``span_s`` from poses (4, 4) and priors, segment by segment. ``fix_s``
-    and ``attitude_s`` are the time constants with which the sensors wander."""
+    """Those of a flight of ``span_s`` from poses (4, 4) and priors, segment by segment."""
     turns = [t for poses, priors in stretches if (t := turns_of(poses, priors)) is not None]
     every = [prior for _, priors in stretches for prior in priors]
-    turned = boresight(turns, span_s, attitude_s)
-    datum = altitude_datum(every, span_s, fix_s)
+    turned = boresight(turns, span_s)
+    datum = altitude_datum(every, span_s)
     return replace(datum, turn=turned.turn, sigma_turn=turned.sigma_turn)
 
 
