@@ -121,7 +121,7 @@ def fit(
 
 def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
     """(7, 7) of a solution, larger where fixes differ by more than their noise."""
-    return np.asarray(np.linalg.inv(found.H)[:7, :7] * max(found.excess, 1.0), np.float64)
+    return np.asarray(np.linalg.inv(found.H)[:7, :7] * max(found.variance_factor, 1.0), np.float64)
 
 
 def _measured(nodes: Sequence[Node], start: Alignment, slow_share: float) -> ReadingNoise:
@@ -137,14 +137,14 @@ def _measured(nodes: Sequence[Node], start: Alignment, slow_share: float) -> Rea
     # begin as if they were as good as places.
     if not fixes.is_height_claimed and len(fixes.fix):
         alike = Noise(float(np.median(fixes.claimed[:, :2])), 0.0, FIX_S)
-        fixes = AlignmentReadings(fixed, ReadingNoise(apart=(alike, alike)))
+        fixes = AlignmentReadings(fixed, ReadingNoise(off_track=(alike, alike)))
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
         at = _solve(fixes, at, SETTLED_START).at
         out = _of_fixes(fixes, at, slow_share)
         fixes = AlignmentReadings(fixed, out)
     ways = AlignmentReadings(moved)
     if len(ways.way) >= MIN_READINGS:
-        drift = ways.moved(_solve(ways, start, SETTLED_START).at)
+        drift = ways.velocity_residuals(_solve(ways, start, SETTLED_START).at)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
         if found is not None:
             # A steady error along a leg looks like another scale: no residual shows it.
@@ -163,40 +163,40 @@ def _of_fixes(fixes: AlignmentReadings, at: Alignment, slow_share: float) -> Rea
     """
     if len(fixes.fix) < MIN_READINGS:
         return ReadingNoise()
-    tilts = fixes.turned(at)[0][fixes.is_assumed, :2]
+    tilts = fixes.attitude_residuals(at)[0][fixes.is_assumed, :2]
     tilt = gauss_markov_noise(fixes.tilt_s, tilts, ATTITUDE_S, 1.0)
     if tilt is not None:
         tilt = tilt.scattered(tilts).bounded(
             ASSUMED_TILT_RAD, ATTITUDE_S, MIN_BIAS * ASSUMED_TILT_RAD
         )
-    apart, is_claimed = fixes.placed(at), fixes.is_height_claimed
-    flat_off, high_off = (gauss_markov_noise(fixes.fix_s, apart[:, k], FIX_S, 1.0) for k in AXES)
-    across = gauss_markov_noise(fixes.fix_s, apart[:, :2], FIX_S)
-    along = gauss_markov_noise(
-        fixes.fix_s, apart[:, 2:], FIX_S, SURE_OF_BIAS if is_claimed else 1.0
+    residuals, is_claimed = fixes.fix_residuals(at), fixes.is_height_claimed
+    off_h, off_v = (gauss_markov_noise(fixes.fix_s, residuals[:, k], FIX_S, 1.0) for k in AXES)
+    horizontal = gauss_markov_noise(fixes.fix_s, residuals[:, :2], FIX_S)
+    vertical = gauss_markov_noise(
+        fixes.fix_s, residuals[:, 2:], FIX_S, SURE_OF_BIAS if is_claimed else 1.0
     )
-    if across is None or along is None or flat_off is None or high_off is None:
+    if horizontal is None or vertical is None or off_h is None or off_v is None:
         return ReadingNoise(tilt=tilt)
     claimed, span_s = np.median(fixes.claimed, axis=0), float(np.ptp(fixes.fix_s))
-    flat, high = float(claimed[:2].mean()), float(claimed[2])
-    over = fixes.over_claim(apart, at.scale, [across.white, along.white])
+    sigma_h, sigma_v = float(claimed[:2].mean()), float(claimed[2])
+    over = fixes.over_claim(residuals, at.scale, [horizontal.white, vertical.white])
     least = 1.0 if is_claimed else MIN_BIAS
-    reach = across.reach(flat, min(least, slow_share))
-    most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift_m)
-    flat_s, high_s = bias_time_constant_s(most), bias_time_constant_s(high)
-    vertical = along.bounded(high, high_s, MIN_BIAS * drift)
+    reach = horizontal.reach(sigma_h, min(least, slow_share))
+    most, drift = horizontal.reach(sigma_h, slow_share), sigma_v if is_claimed else abs(at.drift_m)
+    tau_h_s, tau_v_s = bias_time_constant_s(most), bias_time_constant_s(sigma_v)
+    bounded_v = vertical.bounded(sigma_v, tau_v_s, MIN_BIAS * drift)
     return ReadingNoise(
-        horizontal=across.bounded(most, flat_s, MIN_BIAS * most),
-        vertical=vertical,
-        apart=(
-            flat_off.drifting(most, flat_s, span_s),
-            high_off.drifting(high, high_s, span_s) if is_claimed else vertical,
+        horizontal=horizontal.bounded(most, tau_h_s, MIN_BIAS * most),
+        vertical=bounded_v,
+        off_track=(
+            off_h.drifting(most, tau_h_s, span_s),
+            off_v.drifting(sigma_v, tau_v_s, span_s) if is_claimed else bounded_v,
         ),
-        reach_m=over * [reach, reach, along.reach(high, least)],
+        reach_m=over * [reach, reach, vertical.reach(sigma_v, least)],
         tilt=tilt,
         claimed=claimed,
         over_claim=over,
-        fresh_share=fresh_shares(apart),
+        fresh_share=fresh_shares(residuals),
     )
 
 
@@ -244,7 +244,7 @@ class _Solution:
     at: Alignment
     H: F64
     cost: float
-    excess: float  # variance factor of the fixes: 1 where they differ as their noise says
+    variance_factor: float  # variance factor of the fixes: 1 where they differ as their noise says
 
 
 def _solve(readings: AlignmentReadings, at: Alignment, settled: float) -> _Solution:
@@ -257,12 +257,12 @@ def _solve(readings: AlignmentReadings, at: Alignment, settled: float) -> _Solut
         norms = np.sqrt(np.bincount(readings.group, weights=r**2))
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
         known = readings.information(extra)
-        alone, fixes = readings.alone(r, known, extra), norms[readings.of_fixes]
-        np.maximum(fixes, alone * np.where(alone > ODD, WILD / ODD, 1.0), out=fixes)
+        others, fixes = readings.leave_one_out(r, known, extra), norms[readings.of_fixes]
+        np.maximum(fixes, others * np.where(others > ODD, WILD / ODD, 1.0), out=fixes)
         wild, norms = max(WILD, 2.0 * float(np.median(norms))), np.maximum(norms, 1e-9)
         weight = np.minimum(1.0, HUBER / norms) * np.minimum(1.0, wild / norms) ** 2
         W = readings.weighted(np.column_stack([J, r]), weight, known)
-        extra = readings.doubted(known, extra, weight)
+        extra = readings.outlier_variance(known, extra, weight)
         H, g = J.T @ W[:, :-1] + ridge, J.T @ W[:, -1]
         step = np.linalg.solve(H, -g)
         step[:3] = np.clip(step[:3], -0.5, 0.5)
@@ -270,8 +270,8 @@ def _solve(readings: AlignmentReadings, at: Alignment, settled: float) -> _Solut
         at = at.moved(step)
         if step @ H @ step < settled**2:
             break
-    excess = readings.excess(r, W[:, -1], norms < wild)
-    return _Solution(_centred(readings, at, weight), H, cost, excess)
+    variance_factor = readings.variance_factor(r, W[:, -1], norms < wild)
+    return _Solution(_centred(readings, at, weight), H, cost, variance_factor)
 
 
 def _centred(readings: AlignmentReadings, at: Alignment, weight: F64) -> Alignment:
@@ -280,7 +280,7 @@ def _centred(readings: AlignmentReadings, at: Alignment, weight: F64) -> Alignme
     if not len(readings.fix):
         return at
     each = weight[readings.of_fixes, None] / readings.sigma_fix**2
-    return replace(at, t=at.t - np.average(readings.placed(at), axis=0, weights=each))
+    return replace(at, t=at.t - np.average(readings.fix_residuals(at), axis=0, weights=each))
 
 
 def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[Alignment]:

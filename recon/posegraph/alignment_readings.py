@@ -45,7 +45,7 @@ class ReadingNoise:
 
     horizontal: Noise | None = None  # of a fix, m; None: as it claims
     vertical: Noise | None = None
-    apart: tuple[Noise, Noise] | None = None  # the same off vision's track, which drifts as well
+    off_track: tuple[Noise, Noise] | None = None  # of both off vision's track, which drifts too
     reach_m: F64 | None = None  # (3,) how far fixes may wander
     tilt: Noise | None = None  # of an assumed view about its mount, rad
     claimed: F64 | None = None  # (3,) m as the fixes claim it
@@ -64,10 +64,10 @@ class ReadingNoise:
     def of_fixes(self, claimed: F64) -> tuple[F64, tuple[Noise, Noise]]:
         """(m, 3) sigma of a fix alone, and how such errors, in units of it, go along the track:
         horizontal and vertical."""
-        if self.apart is not None:
-            across, along = (replace(n, white=max(n.white, MIN_FIX_M)) for n in self.apart)
-            single = np.full_like(claimed, [across.total, across.total, along.total])
-            return single, (across.in_units_of(across.total), along.in_units_of(along.total))
+        if self.off_track is not None:
+            h, v = (replace(n, white=max(n.white, MIN_FIX_M)) for n in self.off_track)
+            single = np.full_like(claimed, [h.total, h.total, v.total])
+            return single, (h.in_units_of(h.total), v.in_units_of(v.total))
         tau_s = bias_time_constant_s(float(np.median(claimed[:, 0]))) if len(claimed) else FIX_S
         usual = Noise(1.0, (BIAS_SHARE**-2 - 1.0) ** 0.5, tau_s)
         return BIAS_SHARE * claimed, (usual, usual)
@@ -171,7 +171,7 @@ class AlignmentReadings:
         self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.fix_s = _stack([a.time_s for a in fixed], ())
         self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
-        self.sigma_fix, self.bias = noise.of_fixes(self.claimed)
+        self.sigma_fix, self.fix_noise = noise.of_fixes(self.claimed)
         self.step = _stack([b.place - a.place for a, b, _ in moved], (3,))  # by vision
         self.way = _stack([metres for *_, (metres, _) in moved], (3,))  # the same by velocity
         self.way_s = np.maximum(_stack([s for *_, (_, s) in moved], ()), MIN_WAY_S)
@@ -206,7 +206,7 @@ class AlignmentReadings:
         self._J = np.zeros((len(self.group), UNKNOWNS))  # where it is constant
         self._J[: self._turned, :3] = np.tile(np.eye(3), (len(turned), 1))
         self._J[self._rows, 3:6] = np.tile(np.eye(3), (len(fixed), 1))
-        self._J[self._rows, 10] = np.outer(self.along, [0.0, 0.0, 1.0]).ravel()
+        self._J[self._rows, 10] = np.outer(self.time_share, [0.0, 0.0, 1.0]).ravel()
         self._J[3 * three : -4, 6] = 1.0
         self._J[-4:, 7:] = np.eye(4)
 
@@ -227,7 +227,7 @@ class AlignmentReadings:
         return 0.5 * (first + last), max(0.5 * (last - first), 1e-3)
 
     @property
-    def along(self) -> F64:
+    def time_share(self) -> F64:
         """(m,) times of the fixes, -1 to 1."""
         return from_middle(self.fix_s, *self.span_s)
 
@@ -244,10 +244,10 @@ class AlignmentReadings:
 
     def linearised(self, at: Alignment) -> tuple[F64, F64]:
         """Whitened residuals (M,) and Jacobian (M, UNKNOWNS)."""
-        fix, way = self.placed(at), self.moved(at)
-        turn, of_mount = self.turned(at)
+        fix, way = self.fix_residuals(at), self.velocity_residuals(at)
+        turn, of_mount = self.attitude_residuals(at)
         J = self._J.copy()
-        drifted = np.outer(self.along * at.drift_m, [0.0, 0.0, 1.0])
+        drifted = np.outer(self.time_share * at.drift_m, [0.0, 0.0, 1.0])
         y = np.concatenate([fix + self.fix - drifted - at.t, way + self.way])
         of = J[self._scaled].reshape(-1, 3, UNKNOWNS)
         of[:, :, :3], of[:, :, 6] = -se3.hat(y), y
@@ -259,9 +259,9 @@ class AlignmentReadings:
     def information(self, extra: F64) -> list[F64]:
         """(m, m) inverse covariances of whitened fixes, horizontal and vertical, each with an
         ``extra`` (2, m) variance of its own."""
-        return [n.information(self.fix_s, e) for n, e in zip(self.bias, extra, strict=True)]
+        return [n.information(self.fix_s, e) for n, e in zip(self.fix_noise, extra, strict=True)]
 
-    def alone(self, r: F64, known: Sequence[F64], extra: F64) -> F64:
+    def leave_one_out(self, r: F64, known: Sequence[F64], extra: F64) -> F64:
         """(m,) whitened residual of each fix against what all others tell about its error."""
         fixes, square = r[self._rows].reshape(-1, 3), np.zeros(len(self.fix))
         for axes, P, own in zip(AXES, known, extra, strict=True):
@@ -270,7 +270,7 @@ class AlignmentReadings:
             square += np.sum(left**2, axis=1) / (variance - own)
         return np.sqrt(square)
 
-    def doubted(self, known: Sequence[F64], extra: F64, weight: F64) -> F64:
+    def outlier_variance(self, known: Sequence[F64], extra: F64, weight: F64) -> F64:
         """(2, m) variance that gives fixes the weight (groups,): their neighbours keep theirs."""
         alone = np.array([1.0 / np.diag(P) for P in known]) - extra
         return np.asarray(alone * (1.0 / np.maximum(weight[self.of_fixes], TINY) - 1.0))
@@ -295,22 +295,22 @@ class AlignmentReadings:
         ways = sigma * rows.reshape(len(sigma), 3 * rows.shape[1])
         return (sigma * self._slow.weighted(self.way_end_s, own, ways)).reshape(rows.shape)
 
-    def excess(self, r: F64, weighted: F64, kept: Bool) -> float:
+    def variance_factor(self, r: F64, weighted: F64, kept: Bool) -> float:
         """Variance factor of the fixes by residuals (M,), the same ``weighted``, and which groups
         are ``kept``: 1 where they are as their noise says."""
         free = 3.0 * np.count_nonzero(kept[self.of_fixes]) - 7.0
         return float(r[self._rows] @ weighted[self._rows]) / max(free, 1.0)
 
-    def placed(self, at: Alignment) -> F64:
+    def fix_residuals(self, at: Alignment) -> F64:
         """(m, 3) m from the fixes, without their drift, to where the similarity has them."""
-        placed = at.scale * self.x @ at.R.T + at.t
-        return np.asarray(placed + np.outer(self.along * at.drift_m, [0.0, 0.0, 1.0]) - self.fix)
+        drifted = np.outer(self.time_share * at.drift_m, [0.0, 0.0, 1.0])
+        return np.asarray(at.scale * self.x @ at.R.T + at.t + drifted - self.fix)
 
-    def moved(self, at: Alignment) -> F64:
+    def velocity_residuals(self, at: Alignment) -> F64:
         """(k, 3) m from ways by velocity to those by vision."""
         return np.asarray(at.scale * self.step @ at.R.T - self.way)
 
-    def turned(self, at: Alignment) -> tuple[F64, F64]:
+    def attitude_residuals(self, at: Alignment) -> tuple[F64, F64]:
         """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone. And
         (n, 3, 3) how they change with the mount."""
         n = len(self.R_odom)
@@ -322,11 +322,11 @@ class AlignmentReadings:
         of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
         return off_attitudes(seen, R_prior, self.heading_known), of_mount
 
-    def over_claim(self, apart: F64, scale: float, white: Sequence[float]) -> F64:
-        """(3,) times that fixes scatter further than claimed, 1 at least, by how far (m, 3) they
-        are ``apart`` from the track, which drifts as well, and what is ``white`` of that."""
+    def over_claim(self, residuals: F64, scale: float, white: Sequence[float]) -> F64:
+        """(3,) times that fixes scatter further than claimed, 1 at least, by their
+        ``residuals`` (m, 3) to the track, which drifts as well, and what is ``white`` of these."""
         drift_m = FRAME_DRIFT * scale * float(np.linalg.norm(np.diff(self.x, axis=0), axis=1).sum())
-        far = [1.4826 * float(np.median(np.abs(apart[:, axes]))) for axes in AXES]
+        far = [1.4826 * float(np.median(np.abs(residuals[:, axes]))) for axes in AXES]
         seen = np.sqrt(np.maximum(np.square(far) - drift_m**2, np.square(white)))[[0, 0, 1]]
         return np.asarray(np.maximum(seen / np.median(self.claimed, axis=0), 1.0))
 
@@ -335,7 +335,7 @@ class AlignmentReadings:
         noise. Neither says which of them is wrong."""
         if not len(self.claimed_tilt):
             return np.zeros(2)
-        off: F64 = np.median(self.turned(at)[0][~self.is_assumed, :2], axis=0)
+        off: F64 = np.median(self.attitude_residuals(at)[0][~self.is_assumed, :2], axis=0)
         is_noise = np.linalg.norm(off) < LEVEL_SIGMAS * np.median(self.claimed_tilt)
         return np.zeros(2) if is_noise else off
 

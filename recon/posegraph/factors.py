@@ -71,12 +71,12 @@ class GraphFactors:
         # Of the newest segment: the first node of its last scale, the keyframes that this stands
         # for, and the relative sigmas of vision's steps.
         self._since, self._held, self._lengths = 0, 0, list[float]()
-        self._prior = PosePrior()  # of the newest node, without biases
+        self._prior = PosePrior()  # of the newest node, corrected
 
     def add(self, node: Node, last: Node | None) -> None:
         """A node's motion since the ``last`` one, and its readings."""
         segment = self._segments[node.segment]
-        before, self._prior = self._prior, segment.without_biases(node)
+        before, self._prior = self._prior, segment.corrected(node)
         self.scale_of.append(self._scale(node, last))
         if last is None:
             T, spread = self._first(node)
@@ -100,7 +100,7 @@ class GraphFactors:
 
     def add_loop(self, loop: Loop, a: Node, b: Node) -> None:
         """A loop between two nodes, and the ratio of the depths there, where each has a scale."""
-        scale_m, other_m = (self._segments[end.segment].frame.scale for end in (a, b))
+        scale_m, other_m = (self._segments[end.segment].to_world.scale for end in (a, b))
         metric = loop.scaled(scale_m)
         self.sources[b.key].add("loop")
         scales = self.scale_of[a.key], self.scale_of[b.key]
@@ -118,11 +118,11 @@ class GraphFactors:
     def _first(self, node: Node) -> tuple[F64, F64]:
         """Pose and covariance of the first keyframe: loose where readings will follow. The gauge
         that no reading ever fixes is held at the start."""
-        frame = self._segments[node.segment].frame
-        T = frame.pose(node.T_odom_camera)
+        to_world = self._segments[node.segment].to_world
+        T = to_world.pose(node.T_odom_camera)
         sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
-        if "gnss" in frame.sources:  # places along a line leave the roll about it free
-            known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
+        if "gnss" in to_world.sources:  # places along a line leave the roll about it free
+            known = float(np.sqrt(np.linalg.eigvalsh(to_world.covariance[:3, :3])[-1]))
             sigma_t, sigma_r = 50.0, max(sigma_r, min(known, 1.0))
         sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
         self.smoother.add_turn("prior", node.key, T[:3, :3], sigma[:3])
@@ -133,7 +133,7 @@ class GraphFactors:
         self, node: Node, last: Node, T_last: F64, before: PosePrior
     ) -> tuple[F64, F64, bool]:
         """T_last_node in metres, its (6, 6) covariance, left, in last's frame, and whether vision
-        gives it; now a factor. ``before`` is the prior of the last node without biases."""
+        gives it; now a factor. ``before`` is the last node's corrected prior."""
         is_seen, scale, unit = node.segment == last.segment, NO_SCALE, NO_SCALE
         if is_seen:
             motion, covariance = self._seen(node, last)
@@ -163,7 +163,7 @@ class GraphFactors:
             return NO_SCALE
         if last is None or last.segment != node.segment:
             before, self._lengths = NO_SCALE, []
-            sigma = float(np.clip(segment.frame.sigma_scale, KNOWN_SCALE, UNKNOWN_SCALE))
+            sigma = float(np.clip(segment.to_world.sigma_scale, KNOWN_SCALE, UNKNOWN_SCALE))
         else:
             before, jump = self.scale_of[last.key], self._jump(node, last)
             if node.key - self._since < BLOCK and not jump:
@@ -184,9 +184,10 @@ class GraphFactors:
         return length if length > max(OPEN_LENGTH, OPEN_SHARE * np.median(self._lengths)) else 0.0
 
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
-        frame = self._segments[node.segment].frame
-        motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
-        covariance = se3.in_units(node.covariance, frame.scale) + np.diag([1e-10] * 3 + [1e-6] * 3)
+        to_world = self._segments[node.segment].to_world
+        motion = se3.inverse(to_world.pose(last.T_odom_camera)) @ to_world.pose(node.T_odom_camera)
+        covariance = se3.in_units(node.covariance, to_world.scale)
+        covariance += np.diag([1e-10] * 3 + [1e-6] * 3)
         covariance[3:, 3:] += SIGMA_STEP**2 * np.outer(motion[:3, 3], motion[:3, 3])
         return motion, covariance
 
@@ -194,10 +195,10 @@ class GraphFactors:
         """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
         passed_s = (node.time_ns - last.time_ns) * 1e-9
         segment = self._segments[node.segment]
-        frame = segment.similarity
+        to_world = segment.similarity
         is_new = node.segment != last.segment
-        if is_new and frame is not None and segment.is_tied:
-            T = frame.pose(node.T_odom_camera)
+        if is_new and to_world is not None and segment.is_tied:
+            T = to_world.pose(node.T_odom_camera)
         else:
             priors = self._segments[last.segment].at_camera(last), segment.at_camera(node)
             T = dead_reckoned(*priors, T_last, self._velocity(last, T_last), passed_s)
@@ -229,7 +230,7 @@ class GraphFactors:
         sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, prior.sigma_yaw_rad])
         turn = _turn(T[:3, :3], prior.R_world_camera, prior.sigma_yaw_rad < 1.0)
         sure = np.diag(spread)[:3]
-        # The frame of a placed segment rests on all attitudes: it is no worse than this.
+        # The similarity of a segment rests on all attitudes: it is no worse than this.
         if self._segments[node.segment].similarity is not None:
             sure = np.minimum(sure, np.square(FRAME_SIGMA_RAD))
         allowed = GATE_SIGMAS * np.sqrt(sure + sigma**2)
@@ -249,7 +250,7 @@ class GraphFactors:
         if prior.position_m is None or prior.sigma_position_m is None:
             return False
         sigma = np.maximum(prior.sigma_position_m, MIN_FIX_M)
-        # The frame rests on all fixes: it is no worse than one of them.
+        # The similarity rests on all fixes: it is no worse than one of them.
         drift_m = FRAME_DRIFT * self.path_m[node.key]
         sure = np.minimum(np.diag(se3.about(T[:3, 3], spread))[3:], sigma**2 + drift_m**2)
         apart = np.abs(prior.position_m - T[:3, 3])
@@ -284,7 +285,7 @@ class GraphFactors:
 
     def _height(self, node: Node) -> bool:
         """True when the height above ground was taken as a reading of the scale."""
-        ratio, log = height_ratio(node), np.log(self._segments[node.segment].frame.scale)
+        ratio, log = height_ratio(node), np.log(self._segments[node.segment].to_world.scale)
         if ratio is None or not node.prior.is_agl_measured:
             return False
         if node.lean == 0.0 and abs(ratio[0] - log) > HEIGHT_GATE:

@@ -132,7 +132,7 @@ class PoseGraph:
         return True
 
     def solve(self) -> None:
-        """Fit every segment's frame to all its telemetry again, and rebuild the graph."""
+        """Fit every segment's similarity to all its telemetry again, and rebuild the graph."""
         for segment in self.segments:
             segment.forget()
             self.segments.refit(segment)
@@ -195,7 +195,7 @@ class PoseGraph:
     def scale(self, seq: int) -> float:
         node = self._nodes[seq]
         log = self._smoother.logs()[self._factors.scale_of[node.key]]
-        return self.segments[node.segment].frame.scale * float(np.exp(log))
+        return self.segments[node.segment].to_world.scale * float(np.exp(log))
 
     @property
     def version(self) -> int:
@@ -212,7 +212,7 @@ class PoseGraph:
 
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
-        frames = [np.full(len(s.nodes), s.frame.scale) for s in self.segments]
+        frames = [np.full(len(s.nodes), s.to_world.scale) for s in self.segments]
         logs = self._smoother.logs()[self._factors.scale_of]
         return np.asarray(np.concatenate(frames) * np.exp(logs))
 

@@ -14,7 +14,7 @@ from recon.posegraph.alignment import Scale
 from recon.posegraph.alignment_readings import Alignment, ReadingNoise
 from recon.posegraph.ground import GUESSED_SHARE, guessed_at
 from recon.posegraph.records import Loop, Node
-from recon.posegraph.sensor_offsets import Constants, constants, with_offsets
+from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.types import F64, PosePrior
 
 REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
@@ -44,7 +44,7 @@ class Segment:
     keyframes: int = 0  # in the graph or not
     similarity: Alignment | None = None  # once telemetry or a loop gives it
     constants: Constants = field(default_factory=Constants)  # errors it was fitted with
-    offsets: Constants | None = None  # those with each sensor's own from the similarity
+    offsets: Offsets | None = None  # of its sensors from the similarity
     is_tied_by_loop: bool = False
     fitted: int = 0  # keyframes when the similarity was fitted last
     surface: list[int] = field(default_factory=list)  # its keyframes with depth
@@ -68,8 +68,8 @@ class Segment:
         return is_plausible and not self.is_false
 
     @property
-    def frame(self) -> Alignment:
-        """The similarity; until there is one, its own frame turned to the first attitude."""
+    def to_world(self) -> Alignment:
+        """The similarity; until there is one, the first attitude turns its own frame."""
         if self.similarity is not None:
             return self.similarity
         first = self.nodes[0]
@@ -89,25 +89,27 @@ class Segment:
     @property
     def is_tied(self) -> bool:
         """True when a loop places it, or fixes that measure its scale."""
-        is_scaled = self.rests_on_fixes and self.frame.sigma_scale < GUESSED_SHARE
+        is_scaled = self.rests_on_fixes and self.to_world.sigma_scale < GUESSED_SHARE
         return self.is_tied_by_loop or is_scaled
 
     def forget(self) -> None:
         self.similarity = self.offsets = None
         self.constants, self.fitted, self.is_tied_by_loop = Constants(), 0, False
 
-    def without_biases(self, node: Node) -> PosePrior:
-        """A node's prior without its sensors' constants, its fix brought to the camera."""
-        known = self.offsets or self.constants
-        prior = known.applied(node.prior, node.time_s, node.lean)
+    def corrected(self, node: Node) -> PosePrior:
+        """A node's prior without the constants and offsets of its sensors, its fix brought to the
+        camera."""
+        prior = self.constants.without(node.prior)
+        if self.offsets is not None:
+            prior = self.offsets.without(prior, node.time_s, node.lean)
         return self.at_camera(replace(node, prior=prior))
 
     def at_camera(self, node: Node) -> PosePrior:
         """The prior of a node of it, with its fix brought to where the camera is."""
-        prior, frame = node.prior, self.frame
+        prior, to_world = node.prior, self.to_world
         if prior.fix_offset is None or prior.position_m is None:
             return prior
-        off = frame.scale * (frame.R @ node.T_odom_camera[:3, :3]) @ prior.fix_offset
+        off = to_world.scale * (to_world.R @ node.T_odom_camera[:3, :3]) @ prior.fix_offset
         return replace(prior, position_m=prior.position_m - off, fix_offset=None)
 
     def add_surface(self, seq: int, points: int, prior: PosePrior) -> None:
@@ -198,13 +200,13 @@ class Segments:
                 pieces.merge(a, b)
                 looped |= {a, b}
         # Of those that fixes place, the sigma of the height there.
-        heights = {s.number: s.frame.covariance[5, 5] ** 0.5 for s in known if s.rests_on_fixes}
+        heights = {s.number: s.to_world.covariance[5, 5] ** 0.5 for s in known if s.rests_on_fixes}
         unsure = {number for number, sigma_m in heights.items() if sigma_m > HEIGHT_KNOWN_M}
         main_segment = self.largest()
         of_any_size = {
             number
             for number in heights
-            if self[number] is not main_segment and self[number].frame.sigma_scale >= SCALE_KNOWN
+            if self[number] is not main_segment and self[number].to_world.sigma_scale >= SCALE_KNOWN
         }
         loose = {n for n in unsure if self.sigma_height_m(n) >= HEIGHTS_AGREE_M} | of_any_size
         placed = {segment.number for segment in known if segment.is_fixed} - of_any_size
@@ -242,7 +244,7 @@ class Segments:
         segment.similarity, segment.is_tied_by_loop = placed, True
         # Its sensors' own constants were those from the similarity before.
         readings = self._without_constants(segment, segment.constants)
-        segment.offsets = with_offsets(segment.constants, readings, placed)
+        segment.offsets = offsets(readings, placed)
 
     def refit(self, segment: Segment) -> bool:
         """True when the segment's similarity was fitted again, which is due as the segment grows.
@@ -271,7 +273,7 @@ class Segments:
                 before, mount_rad=found.mount_rad, drift_m=found.drift_m, span_s=found.span_s
             )
         segment.similarity, segment.constants = found, fresh
-        segment.offsets = with_offsets(fresh, readings, found)
+        segment.offsets = offsets(readings, found)
         return True
 
     def _newest_constants(self) -> Constants:
@@ -290,7 +292,7 @@ class Segments:
         known = [one for one in self if one.rests_on_fixes]
         known = known or [one for one in islice(self, 1) if one.similarity is not None]
         apart = [
-            n.prior.altitude_m - segment.frame.pose(n.T_odom_camera)[2, 3]
+            n.prior.altitude_m - segment.to_world.pose(n.T_odom_camera)[2, 3]
             for segment in known
             for n in segment.nodes
             if n.prior.altitude_m is not None
@@ -302,22 +304,24 @@ class Segments:
         segment = self.largest()
         if segment is None:
             return None, None
-        return alignment.scales(self._without_constants(segment, segment.constants), segment.frame)
+        return alignment.scales(
+            self._without_constants(segment, segment.constants), segment.to_world
+        )
 
     def _without_constants(self, segment: Segment, known: Constants) -> list[Node]:
         """A segment's nodes without these errors; an assumed height is that of the flight."""
         height_m = self._usual_height_m()
         return [
-            replace(n, prior=guessed_at(height_m, known.applied(n.prior))) for n in segment.nodes
+            replace(n, prior=guessed_at(height_m, known.without(n.prior))) for n in segment.nodes
         ]
 
     def _usual_height_m(self) -> float | None:
         """Height above ground of the largest segment, if its scale is measured."""
         segment = self.largest()
-        if segment is None or segment.frame.sigma_scale >= GUESSED_SHARE:
+        if segment is None or segment.to_world.sigma_scale >= GUESSED_SHARE:
             return None
         heights = [n.height for n in segment.nodes if n.height is not None]
-        return segment.frame.scale * float(np.median(heights)) if heights else None
+        return segment.to_world.scale * float(np.median(heights)) if heights else None
 
 
 def _bend_rad(nodes: list[Node]) -> float:

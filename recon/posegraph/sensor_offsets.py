@@ -1,7 +1,7 @@
-"""Constant difference of each sensor from the similarity that places a segment.
+"""Constant errors of the sensors: of a whole flight, and of one segment against its similarity.
 
-The similarity settles the constants of each sensor, so they are removed from its readings before
-these enter the graph: only variation along the track may bend it.
+Both are removed from the readings before these enter the graph: only variation along the track may
+bend it.
 """
 
 from __future__ import annotations
@@ -31,45 +31,52 @@ ROUNDS = 6  # Gauss-Newton steps, each with new robust weights
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Constants:
-    """Constant errors of sensors: of a whole flight, whatever becomes of the track, and of one
-    segment against its alignment.
-
-    The boresight: ``R_world_camera = R_reported @ exp(turn)``. The altitudes' datum: ``up_m`` is to
-    be added to them.
-    """
+    """Of a whole flight, whatever becomes of the track. The boresight: ``R_world_camera =
+    R_reported @ exp(turn)``. The altitudes' datum: ``up_m`` is to be added to them."""
 
     turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, in the camera's frame
     sigma_turn: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
     up_m: float = 0.0
     sigma_up_m: float = float("inf")  # of what is then left of the constant
     slow_share: float = 1.0  # of the receiver's variance; the rest is new in each fix
-    # Of one segment.
-    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns assumed views
-    drift_m: float = 0.0  # by which altitudes are too high in the end, and too low at first
-    span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
-    turn_world: F64 = field(default_factory=lambda: np.zeros(3))  # takes attitudes to it
-    log_height: float = 0.0  # log of the alignment's scale over that of the heights
-    centre_m: F64 = field(default_factory=lambda: np.zeros(3))  # of the fixes
-    shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to it
-    warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # per metre off centre
-    reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
-    is_exact: bool = False  # only heights of the ground exactly below count
 
     @property
     def is_turn_sure(self) -> bool:
         """True when the boresight is significant; otherwise it is not applied."""
         return float(np.sum(np.square(self.turn / self.sigma_turn))) > SURE
 
-    def applied(self, prior: PosePrior, time_s: float = 0.0, lean: float = 0.0) -> PosePrior:
+    def without(self, prior: PosePrior) -> PosePrior:
+        """A prior without them."""
+        R, position = prior.R_world_camera, prior.position_m
+        if R is not None and self.is_turn_sure:
+            R = R @ se3.so3_exp(self.turn)
+        if position is not None:
+            position = position + np.array([0.0, 0.0, self.up_m])
+        return replace(prior, R_world_camera=R, position_m=position)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Offsets:
+    """Of one segment, from its sensors to its similarity; without the :class:`Constants`."""
+
+    at: Alignment  # the similarity: it has the mount of assumed views and the altitudes' drift
+    turn_world: F64 = field(default_factory=lambda: np.zeros(3))  # takes attitudes to it
+    log_height: float = 0.0  # log of its scale over that of the heights
+    centre_m: F64 = field(default_factory=lambda: np.zeros(3))  # of the fixes
+    shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to it
+    warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # per metre off centre
+    reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
+    is_exact: bool = False  # only heights of the ground exactly below count
+
+    def without(self, prior: PosePrior, time_s: float, lean: float = 0.0) -> PosePrior:
         """A prior without them; ``lean`` is that of the ground whose height vision measures."""
         R, position, agl = prior.R_world_camera, prior.position_m, prior.agl_m
         if R is not None:
-            R = R @ se3.so3_exp(self.turn) if self.is_turn_sure else R
-            R = R @ se3.so3_exp(self.mount_rad) if prior.is_view_assumed else R
+            R = R @ se3.so3_exp(self.at.mount_rad) if prior.is_view_assumed else R
             R = se3.so3_exp(self.turn_world) @ R
         if position is not None:
-            drift_m = self.drift_m * float(from_middle(time_s, *self.span_s))
-            position = position + np.array([0.0, 0.0, self.up_m]) - np.array([0.0, 0.0, drift_m])
+            drift_m = self.at.drift_m * float(from_middle(time_s, *self.at.span_s))
+            position = position - np.array([0.0, 0.0, drift_m])
             off = position - self.centre_m
             off = off * min(1.0, self.reach_m / max(float(np.linalg.norm(off)), 1e-9))
             position = position + self.shift_m + self.warp @ off
@@ -202,7 +209,7 @@ def _wandered(above: F64, fixes: F64, white: float) -> float:
     return apart - scatter if apart > BY_CHANCE * scatter else 0.0
 
 
-PRIOR_SIGMA = 0.1  # rad and share; how far fixes may be turned and stretched against the frame
+PRIOR_SIGMA = 0.1  # rad and share; how far fixes may be turned and stretched against the similarity
 
 GATE_SIGMAS = 5.0
 """Beyond so many sigmas from the prediction a reading is left out, as noise alone reaches that once
@@ -227,29 +234,25 @@ def constants(
     return replace(datum, turn=turned.turn, sigma_turn=turned.sigma_turn)
 
 
-def with_offsets(known: Constants, nodes: Sequence[Node], frame: Alignment) -> Constants:
-    """The same with those of one segment, robustly over its nodes, which are without ``known``."""
-    drift = Constants(mount_rad=frame.mount_rad, drift_m=frame.drift_m, span_s=frame.span_s)
-    nodes = [replace(n, prior=drift.applied(n.prior, n.time_s)) for n in nodes]
+def offsets(nodes: Sequence[Node], at: Alignment) -> Offsets:
+    """Those of one segment, robustly over its nodes, which are without the flight's constants."""
+    fitted = Offsets(at)
+    nodes = [replace(n, prior=fitted.without(n.prior, n.time_s)) for n in nodes]
     ratios, independent = height_ratios(nodes)
     log_height = 0.0
     if ratios:
         mean = np.average([r[0] for r in ratios], weights=[r[1] ** -2 for r in ratios])
-        log_height = float(np.log(frame.scale) - mean)
-    centre_m, shift_m, warp, reach_m = _fixes(nodes, frame)
-    return replace(
-        known, mount_rad=frame.mount_rad, drift_m=frame.drift_m, span_s=frame.span_s,
-        turn_world=_turn(nodes, frame), log_height=log_height, centre_m=centre_m, shift_m=shift_m,
-        warp=warp, reach_m=reach_m, is_exact=independent == EXACT_HEIGHTS,
-    )  # fmt: skip
+        log_height = float(np.log(at.scale) - mean)
+    is_exact = independent == EXACT_HEIGHTS
+    return Offsets(at, _turn(nodes, at), log_height, *_fixes(nodes, at), is_exact)
 
 
-def _turn(nodes: Sequence[Node], frame: Alignment) -> F64:
-    """(3,) mean rotation from the attitudes to the frame; its heading only if they have one."""
+def _turn(nodes: Sequence[Node], at: Alignment) -> F64:
+    """(3,) mean rotation from the attitudes to the similarity; a heading only if they have one."""
     known = [n for n in nodes if n.prior.R_world_camera is not None]
     if not known:
         return np.zeros(3)
-    seen = frame.R @ np.array([n.T_odom_camera[:3, :3] for n in known])
+    seen = at.R @ np.array([n.T_odom_camera[:3, :3] for n in known])
     measured = np.array([n.prior.R_world_camera for n in known])
     sigma = np.array([[n.prior.sigma_tilt_rad] * 2 + [n.prior.sigma_yaw_rad] for n in known])
     turns = off_attitudes(seen, measured, sigma[:, 2] < 1.0)
@@ -259,11 +262,11 @@ def _turn(nodes: Sequence[Node], frame: Alignment) -> F64:
     return turn if np.all(np.abs(turn) < allowed) else np.zeros(3)
 
 
-def _fixes(nodes: Sequence[Node], frame: Alignment) -> tuple[F64, F64, F64, float]:
+def _fixes(nodes: Sequence[Node], at: Alignment) -> tuple[F64, F64, F64, float]:
     """Centre, shift, warp (3, 3) and reach of the fixes, turned and stretched about the centre."""
     nothing = np.zeros(3), np.zeros(3), np.zeros((3, 3)), 0.0
     rows = [
-        (frame.points(a.place_of_fix), a.prior.position_m, a.prior.sigma_position_m)
+        (at.points(a.place_of_fix), a.prior.position_m, a.prior.sigma_position_m)
         for a in nodes
         if a.prior.position_m is not None and a.prior.sigma_position_m is not None
     ]

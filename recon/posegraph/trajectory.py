@@ -95,20 +95,20 @@ class Trajectory:
             node = self.pose(int(self._table.rows["seq"][self._node_before(row)[0]]))
             return replace(node, T_world_camera=T[0], scale=float(scales[0]))
         pose = self.graph.pose(seq)
-        frame = self.graph.segments[self.graph.node(seq).segment].similarity
+        similarity = self.graph.segments[self.graph.node(seq).segment].similarity
         T, covariance = pose.T_world_camera, pose.covariance
-        if frame is None:  # its scale and heading are not known
+        if similarity is None:  # its scale and heading are not known
             covariance = covariance + se3.about(-T[:3, 3], np.eye(6))
-        elif frame.sigma_fixes is not None and frame.sigma_counted is not None:
+        elif similarity.sigma_fixes is not None and similarity.sigma_counted is not None:
             own = np.diag(se3.about(T[:3, 3], covariance))[3:]
-            bent = np.maximum(own - frame.sigma_counted**2, 0.0)
+            bent = np.maximum(own - similarity.sigma_counted**2, 0.0)
             # The mean error of the fixes bends nothing, and the graph cannot know it.
-            factor = np.r_[1.0, 1.0, 1.0, np.sqrt((bent + frame.sigma_fixes**2) / own)]
+            factor = np.r_[1.0, 1.0, 1.0, np.sqrt((bent + similarity.sigma_fixes**2) / own)]
             covariance = se3.about(T[:3, 3], covariance) * np.outer(factor, factor)
             covariance = se3.about(-T[:3, 3], covariance)
-        if frame is not None and frame.lean is not None:  # nothing in the graph shows it
-            covariance = covariance + frame.lean
-        return replace(pose, covariance=covariance, is_aligned=frame is not None)
+        if similarity is not None and similarity.lean is not None:  # nothing in the graph shows it
+            covariance = covariance + similarity.lean
+        return replace(pose, covariance=covariance, is_aligned=similarity is not None)
 
     def places(self, seqs: Sequence[int]) -> F64:
         return self._placed(np.searchsorted(self._table.rows["seq"], seqs))[0]

@@ -242,9 +242,9 @@ class Recorder:
         found = graph.segments.largest()
         if found is None:
             return {"from": FIRST_TELEMETRY, "sigma": None}
-        by = ", ".join(found.frame.sources)
-        if not {"altitude", "gnss"} & set(found.frame.sources):
-            is_known = found.frame.sigma_scale < GUESSED_SHARE / 2
+        by = ", ".join(found.to_world.sources)
+        if not {"altitude", "gnss"} & set(found.to_world.sources):
+            is_known = found.to_world.sigma_scale < GUESSED_SHARE / 2
             by = "velocity" if is_known else "an assumed height"
         out = {"from": by, "sigma": round(sigma_of_scale(graph), 4)}
         ratio = gnss_over_heights(graph)
@@ -253,7 +253,7 @@ class Recorder:
     def _lean_sigma_deg(self) -> float | None:
         """Sigma of what is level, of the largest segment; None where attitudes show it."""
         found = self._graph.segments.largest()
-        sigma = None if found is None else found.frame.sigma_lean_rad
+        sigma = None if found is None else found.to_world.sigma_lean_rad
         return None if sigma is None else round(math.degrees(sigma), 2)
 
     def _write_origin(self) -> None:

@@ -80,7 +80,7 @@ def sigma_of_scale(graph: PoseGraph) -> float:
     leave it as unsure as they are apart."""
     found, growth = graph.segments.largest(), abs(graph.largest_growth())
     assert found is not None
-    sigma = found.frame.sigma_scale
+    sigma = found.to_world.sigma_scale
     return growth if growth > SIGMAS * sigma else sigma
 
 

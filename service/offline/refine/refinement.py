@@ -426,7 +426,7 @@ class _Refinement:
             return []
         priors = [PosePrior() if s is None else rig.prior(s, None) for s in states]
         known = constants([(list(self.states.poses), priors)], (times[-1] - times[0]) * 1e-9)
-        return [known.applied(prior) for prior in priors]
+        return [known.without(prior) for prior in priors]
 
     # ---- loops -------------------------------------------------------------------------------
 

@@ -299,7 +299,7 @@ def test_a_segment_that_loops_shrink_tells_by_how_much() -> None:
         growth = graph.scale(a) / graph.scale(b)
         graph.add_loop(a, b, T_a_b, np.diag([1e-3**2] * 3 + [0.03**2] * 3), growth)
     found = graph.segments.largest()
-    assert found is not None and found.frame.sigma_scale < 0.03
+    assert found is not None and found.to_world.sigma_scale < 0.03
     assert graph.largest_growth() == pytest.approx(np.log(0.9), abs=0.03)
 
 
