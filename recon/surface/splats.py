@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import partial, reduce
 
 import cv2
 import numpy as np
@@ -97,7 +97,7 @@ def joined(parts: Sequence[Splats]) -> Splats:
 def splats_of(
     keyframes: Sequence[Keyframe],
     views: Sequence[TextureView],
-    surface: Mesh,
+    surface: Callable[[], Mesh],
     progress: Callable[[str], None] = lambda _: None,
     detail_levels: float = 0,
 ) -> Splats:
@@ -105,7 +105,7 @@ def splats_of(
 
     ``views`` are the keyframes' images without distortion, as fine as the Gaussians shall be. A
     square of pixels that differ by at most ``detail_levels`` from the squares' interpolated means
-    has no detail.
+    has no detail. ``surface`` is asked for late: it may be made meanwhile.
     ``progress`` is called once per keyframe and :func:`steps` times in all.
     """
 
@@ -153,7 +153,7 @@ def _known_pixels(
     """
     xyz, normal, sigma, opacity, rgb, side = _pixels(
         np.ascontiguousarray(depth.depth_m, np.float32), np.ascontiguousarray(depth.sigma_m),
-        np.ascontiguousarray(depth.views), mask, _normals(depth), depth.K, view.bgra, view.K,
+        np.ascontiguousarray(depth.views), mask, depth.K, view.bgra, view.K,
         _squares(depth, mask, view, detail_levels),
     )  # fmt: skip
     footprint = xyz[:, 2] / np.float32(np.sqrt(view.K[0, 0] * view.K[1, 1]))
@@ -187,7 +187,7 @@ def _squares(depth: DepthMap, mask: Bool, view: TextureView, detail_levels: floa
             few = cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)  # noqa: B023
             return cv2.absdiff(image, cv2.resize(few, image.shape[1::-1]))
 
-        busy = off(view.bgra[whole]).max(axis=2) > detail_levels
+        busy = reduce(np.maximum, np.moveaxis(off(view.bgra[whole]), 2, 0)) > detail_levels
         busy |= (off(fine[whole]) > FLAT * fine[whole]) | is_blank[whole]
         is_flat = ~busy.reshape(blocks).any(axis=(1, 3))
         square = out[whole].reshape(blocks)
@@ -215,27 +215,30 @@ def of_depth(depth: DepthMap, mask: Bool, view: TextureView) -> Splats:
     return _gaussians(_known_pixels(depth, mask, view), slice(None), view)
 
 
-def _normals(depth: DepthMap) -> F32:
-    """(h, w, 3) of the surface in the camera's axes, towards it; to the camera itself where the
-    neighbours belong to other surfaces."""
-    h, w = depth.depth_m.shape
-    u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
-    ways = rays(depth.K, np.column_stack([u.ravel(), v.ravel()])).reshape(h, w, 3)
-    xyz = np.pad(ways * depth.depth_m[..., None], [(NORMAL_PX,) * 2] * 2 + [(0, 0)],
-                 constant_values=np.nan)  # fmt: skip
-    n = NORMAL_PX
-    right = xyz[n:-n, 2 * n :] - xyz[n:-n, : -2 * n]
-    down = xyz[2 * n :, n:-n] - xyz[: -2 * n, n:-n]
-    limit = 2 * n * MAX_SLOPE * depth.depth_m
-    one = (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
-    out = np.where(one[..., None], np.cross(down, right), -ways)
-    return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True), np.float32)
+@njit(cache=True, nogil=True)
+def _normal(depth: F32, K: F64, row: int, col: int, out: F32) -> None:
+    """Fill ``out`` (3,) with the surface's normal at a pixel in the camera's axes, towards it; to
+    the camera itself where the neighbours belong to other surfaces."""
+    n, (h, w) = NORMAL_PX, depth.shape
+    x, y = (col - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]
+    a, b, c = -x, -y, -1.0
+    if n <= row < h - n and n <= col < w - n:
+        west, east = float(depth[row, col - n]), float(depth[row, col + n])
+        north, south = float(depth[row - n, col]), float(depth[row + n, col])
+        rise, fall = east - west, south - north
+        limit = np.float32(2 * n * MAX_SLOPE) * depth[row, col]
+        if abs(rise) < limit and abs(fall) < limit:
+            right = x * rise + n / K[0, 0] * (east + west)
+            down = y * fall + n / K[1, 1] * (south + north)
+            a, b = down * rise - y * fall * rise, fall * right - x * fall * rise
+            c = x * fall * y * rise - down * right
+    size = np.sqrt(a * a + b * b + c * c)
+    out[0], out[1], out[2] = a / size, b / size, c / size
 
 
 @njit(cache=True, nogil=True)
 def _pixels(
-    depth: F32, sigma: F32, views: U8, mask: Bool, normals: F32, K: F64, bgra: U8, K_view: F64,
-    sides: U8,
+    depth: F32, sigma: F32, views: U8, mask: Bool, K: F64, bgra: U8, K_view: F64, sides: U8
 ) -> tuple[F32, F32, F32, F32, F32, F32]:  # fmt: skip
     """Of squares of pixels: place and normal (N, 3) in the camera's axes, sigma (N,) m, opacity
     (N,), mean RGB (N, 3) and side (N,)."""
@@ -270,8 +273,8 @@ def _pixels(
                         weights += weight
             z = total / weights if weights > 0.0 else near
             xyz[n, 0], xyz[n, 1], xyz[n, 2] = x * z, y * z, z
+            _normal(depth, K, at_v, at_u, normal[n])
             for k in range(3):
-                normal[n, k] = normals[at_v, at_u, k]
                 rgb[n, k] = bgra[row : row + side, col : col + side, 2 - k].mean()
             side_px[n] = side
             spread_m[n] = sigma[at_v, at_u]
@@ -346,10 +349,10 @@ def _is_lone(xyz_m: F32, pixels: F32, cell_m: float) -> Bool:
 
 
 def _fillings(
-    splats: Splats, views: Sequence[TextureView], surface: Mesh, progress: Callable[[str], None]
-) -> list[Splats]:
+    splats: Splats, views: Sequence[TextureView], surface: Callable[[], Mesh],
+    progress: Callable[[str], None],
+) -> list[Splats]:  # fmt: skip
     """Gaussians on ``surface`` where views show a hole, which no earlier view has filled."""
-    reach = rays_onto(surface)
 
     def behind(view: TextureView) -> F32:
         progress("filling holes from the closed surface")
@@ -358,7 +361,9 @@ def _fillings(
         return left
 
     out: list[Splats] = []
-    for view, left in zip(views, run_parallel(*(partial(behind, v) for v in views)), strict=True):
+    lefts = run_parallel(*(partial(behind, v) for v in views))
+    reach = rays_onto(surface())
+    for view, left in zip(views, lefts, strict=True):
         for one in out:
             _hide(one, view, left)
         hole = (left > 1.0 - COVERED) & (view.bgra[..., 3] > 0)
@@ -438,7 +443,12 @@ def _nearest_first(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> 
     """(M,) the Gaussians that may show in an image; of those equally near, of which flat ground has
     many, the first one first on every machine."""
     rows, depth = _in_view(splats, K, size_px, T)
-    return np.asarray(rows[np.argsort(depth, kind="stable")])
+    # The bits of positive numbers are in their order, and 16 of them are sorted by digits: twice
+    # that takes a third of the time.
+    bits = depth.view(np.uint32)
+    order = np.argsort(bits.astype(np.uint16), kind="stable")
+    high = (bits >> 16).astype(np.uint16)[order]
+    return np.asarray(rows[order[np.argsort(high, kind="stable")]])
 
 
 def _widest(K: F64, size_px: tuple[int, int]) -> tuple[float, float]:

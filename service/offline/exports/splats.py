@@ -80,11 +80,9 @@ def _made(scan: ScanView, options: ExportOptions, box: Box) -> Splats | None:
     """The Gaussians of one tile, in ENU metres; None without any."""
     keyframes = list(main_keyframes(scan.store))
     progress = scan.progress
-    fused = scan.fused
-    with refusing(str(scan.folder)):
-        surface = closed_surface(scan, LARGEST_FACES)
     with progress.part("reading images", 0.2):
         views = shared_images(scan, options)
+    fused = scan.fused
     pairs = list(zip(keyframes, views, strict=True))
     tried = pairs[:: -(-len(pairs) // COUNTED)]
     for detail in DETAILS:
@@ -97,7 +95,8 @@ def _made(scan: ScanView, options: ExportOptions, box: Box) -> Splats | None:
     if coarser > 1.05:
         shrink = min(shrink, keyframes[0].depth.K[0, 0] / (views[0].K[0, 0] * coarser))
     views = [resized(v, shrink) for v in views]
-    with progress.part("Gaussians"):
+    with progress.part("Gaussians"), refusing(str(scan.folder)):
+        surface = partial(closed_surface, scan, LARGEST_FACES)  # another product may make it now
         say = progress.counting(steps(len(keyframes)))
         splats = splats_of(keyframes, views, surface, say, detail)
     if box != EVERYWHERE:

@@ -185,7 +185,7 @@ def test_a_view_from_elsewhere_shows_the_surface() -> None:
     corners = np.array([[-30.0, -30.0], [30.0, -30.0], [30.0, 30.0], [-30.0, 30.0]])
     plane = np.column_stack([corners, -corners[:, 1] * 0.1 / 0.995])
     surface = Mesh(plane, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
-    splats = splats_of(keyframes, views, surface)
+    splats = splats_of(keyframes, views, lambda: surface)
     assert len(splats) < 0.7 * 3 * SIZE[0] * SIZE[1]  # places that several show have one
     T = se3.compose(DOWN, np.array([0.7, 0.4, 20.0]))
     image, opacity = rendered(splats, K, SIZE, T)
@@ -205,7 +205,7 @@ def test_flat_areas_have_few_gaussians_and_edges_all() -> None:
     one = keyframe(0, depth)
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
     surface = Mesh(corners, np.array([[0, 1, 2]], np.int32))
-    splats = splats_of([one], [view], surface, detail_levels=4)
+    splats = splats_of([one], [view], lambda: surface, detail_levels=4)
     side = np.rint(splats.sigma_m[:, 1] / WIDTH * 60.0 / -(splats.xyz_m[:, 2] - 20.0)).astype(int)
     u = 31.5 + 60.0 * splats.xyz_m[:, 0] / (20.0 - splats.xyz_m[:, 2])
     assert np.unique(side).tolist() == [1, 2, 4, 8]
@@ -239,7 +239,8 @@ def test_what_other_views_see_through_is_left_out() -> None:
     depths[0].depth_m[20:26, 30:36] = 12.0  # invented
     keyframes = [keyframe(n, d) for n, d in enumerate(depths)]
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
-    splats = splats_of(keyframes, views, Mesh(corners, np.array([[0, 1, 2]], np.int32)))
+    surface = Mesh(corners, np.array([[0, 1, 2]], np.int32))
+    splats = splats_of(keyframes, views, lambda: surface)
     assert np.abs(splats.xyz_m[:, 2]).max() < 1.0
 
 
@@ -251,7 +252,8 @@ def test_a_place_that_two_images_show_has_one_gaussian() -> None:
     )
     surface = Mesh(corners, np.array([[0, 1, 2]], np.int32))
     one, two = (
-        len(splats_of([keyframe(k, depth) for k in range(n)], [view] * n, surface)) for n in (1, 2)
+        len(splats_of([keyframe(k, depth) for k in range(n)], [view] * n, lambda: surface))
+        for n in (1, 2)
     )
     assert one > 0.9 * depth.depth_m.size and two == pytest.approx(one, rel=0.1)
 
@@ -262,5 +264,18 @@ def test_nothing_hangs_alone_in_the_air() -> None:
     depth.depth_m[20:26, 30:36] = 12.0  # invented, and no other view looks there
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
     surface = Mesh(corners, np.array([[0, 1, 2]], np.int32))
-    splats = splats_of([keyframe(0, depth)], [view], surface)
+    splats = splats_of([keyframe(0, depth)], [view], lambda: surface)
     assert np.abs(splats.xyz_m[:, 2]).max() < 1.0
+
+
+def test_the_surface_is_asked_for_once_the_depth_images_are_done() -> None:
+    depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
+    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
+    steps: list[str] = []
+
+    def surface() -> Mesh:
+        steps.append("surface")
+        return Mesh(corners, np.array([[0, 1, 2]], np.int32))
+
+    splats_of([keyframe(0, depth)], [painted(depth)], surface, steps.append)
+    assert steps.count("surface") == 1 and steps.index("surface") >= 2
