@@ -243,12 +243,13 @@ def score(
 
 def _text_of_views(report: dict[str, Any]) -> str:
     lines = [
-        f"{'drawn from':<12} {'frames':>6} {'covered':>8} {'PSNR':>9} {'SSIM':>7} {'on grids':>9}"
+        f"{'drawn from':<12} {'frames':>6} {'covered':>8} {'PSNR':>9} {'SSIM':>7} {'on grids':>9} "
+        f"{'exposed':>9}"
     ]
     for name, r in report.items():
         lines.append(
             f"{name:<12} {r['frames']:>6} {r['covered']:>8.2%} {r['psnr_db']:>6.2f} dB "
-            f"{r['ssim']:>7.4f} {r['psnr_on_grids_db']:>6.2f} dB"
+            f"{r['ssim']:>7.4f} {r['psnr_on_grids_db']:>6.2f} dB {r['psnr_exposed_db']:>6.2f} dB"
         )
     return "\n".join(lines)
 

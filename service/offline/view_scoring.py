@@ -1,8 +1,10 @@
 """How a scan looks to cameras that took no part in it: their frames, drawn from its products.
 
 Each frame is rendered at its own pose and compared with what the camera saw: the share of pixels
-that are covered, PSNR and SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861) of these, and PSNR
-of those that the depth images cover too: only there do two products show the same places.
+that are covered, PSNR and SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861) of these, PSNR of
+those that the depth images cover too, where alone two products show the same places, and PSNR after
+one gain and offset for each channel, as RawNeRF is scored (Mildenhall et al. 2022): no product
+knows the exposure of a frame that took no part.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ from service.stream.records import PoseRecord
 EVERY = 10
 """Of the frames that are no keyframe, the first of so many is drawn."""
 
-NEIGHBOURS = 8
+NEIGHBOURS = 12
 """Keyframes that place a frame which the scan does not know."""
 
 OWN_SHARE = 0.9
@@ -84,9 +86,10 @@ class FrameScore(NamedTuple):
     psnr_db: float
     ssim: float
     psnr_on_grids_db: float  # of the pixels that the depth images cover too
+    psnr_exposed_db: float  # as the frame is exposed
 
 
-DIGITS = {"covered": 4, "psnr_db": 2, "ssim": 4, "psnr_on_grids_db": 2}
+DIGITS = {"covered": 4, "psnr_db": 2, "ssim": 4, "psnr_on_grids_db": 2, "psnr_exposed_db": 2}
 
 
 def score_views(
@@ -146,6 +149,7 @@ def frame_scores(
                         _psnr_db(seen, drawn, covered),
                         float(likeness[covered].mean()),
                         _psnr_db(seen, drawn, covered & grids),
+                        _psnr_db(seen, exposed_as(seen, drawn, covered), covered),
                     )
                 )
         if images is not None:
@@ -157,9 +161,16 @@ def frame_scores(
     return {name: rows for name, rows in scores.items() if rows}
 
 
-def _psnr_db(seen: U8, drawn: U8, where: Bool) -> float:
+def _psnr_db(seen: U8, drawn: U8 | F64, where: Bool) -> float:
     error = float(np.mean((seen[where].astype(np.float64) - drawn[where]) ** 2))
     return min(10.0 * float(np.log10(255.0**2 / max(error, 1e-9))), FLOOR_DB)
+
+
+def exposed_as(seen: U8, drawn: U8, where: Bool) -> F64:
+    """``drawn`` (H, W, 3) with the gain and offset of each channel that fit ``seen`` best."""
+    fits = [np.polyfit(drawn[where][:, c], seen[where][:, c], 1) for c in range(3)]
+    gain, offset = np.array(fits).T
+    return np.asarray(np.clip(drawn * gain + offset, 0.0, 255.0))
 
 
 def _seen(
@@ -207,29 +218,48 @@ def placed(
     image: U8, time_ns: int, keyframes: Sequence[Keyframe], camera: Camera,
     features_of: Callable[[Keyframe], Features] = keyframe_features,
 ) -> F64 | None:  # fmt: skip
-    """(4, 4) T_world_camera of ``image`` (H, W, 3), by features that it shares with the keyframes
-    next to it in time, where their depth is known; None where these are too few.
+    """(4, 4) T_world_camera of ``image`` (H, W, 3), by features that it shares with keyframes where
+    their depth is known; None where these are too few.
 
-    ``features_of`` gives those of a keyframe's image.
+    The keyframes next to it in time say where it is, and then those that show the same ground: by
+    one strip alone, whose shared ground may be a stripe at the image's edge, it errs by pixels.
+    ``features_of`` gives the features of a keyframe's image.
     """
     w = min(camera.size_px[0], 2 * keyframes[0].bgr.shape[1])  # features of much finer ones differ
     small = scaled(camera, (w, round(w * camera.size_px[1] / camera.size_px[0])))
     there = _features(
         np.asarray(cv2.resize(image, small.size_px, interpolation=cv2.INTER_AREA), np.uint8)
     )
-    points, pixels = [np.zeros((0, 3))], [np.zeros((0, 2))]
-    for k in sorted(keyframes, key=lambda k: abs(k.time_ns - time_ns))[:NEIGHBOURS]:
-        shared = match_features(features_of(k), there)
-        if shared is None:
-            continue
-        u, v = np.rint(shared.uv_a).astype(int).T
-        z = np.where(k.fresh, k.depth.depth_m, np.nan)[v, u]
-        known = np.isfinite(z)
-        local = rays(k.depth.K, shared.uv_a[known]) * z[known, None]
-        points.append(se3.transform(k.depth.T_world_camera, local))
-        pixels.append(shared.uv_b[known])
-    found = pnp.solve(np.concatenate(points), np.concatenate(pixels), small.K)
-    return None if found is None else se3.inverse(found.T_camera_points)
+    T, apart = None, np.array([abs(k.time_ns - time_ns) for k in keyframes], np.float64)
+    ahead_m = np.array([float(np.nanmedian(k.depth.depth_m)) for k in keyframes])
+    poses = np.array([k.depth.T_world_camera for k in keyframes])
+    for _ in range(2):
+        nearest = np.argsort(apart, kind="stable")[:NEIGHBOURS]
+        points, pixels = zip(
+            *(_shared(keyframes[n], there, features_of) for n in nearest), strict=True
+        )
+        found = pnp.solve(np.concatenate(points), np.concatenate(pixels), small.K)
+        if found is None:
+            break
+        T = se3.inverse(found.T_camera_points)
+        shown = poses[:, :3, 3] + ahead_m[:, None] * poses[:, :3, 2]
+        apart = np.linalg.norm(shown - T[:3, 3] - ahead_m[nearest[0]] * T[:3, 2], axis=1)
+    return T
+
+
+def _shared(
+    keyframe: Keyframe, there: Features, features_of: Callable[[Keyframe], Features]
+) -> tuple[F64, F64]:
+    """(N, 3) places that a keyframe and an image both show, and (N, 2) where the image does."""
+    shared = match_features(features_of(keyframe), there)
+    if shared is None:
+        return np.zeros((0, 3)), np.zeros((0, 2))
+    depth = keyframe.depth
+    u, v = np.rint(shared.uv_a).astype(int).T
+    z = np.where(keyframe.fresh, depth.depth_m, np.nan)[v, u]
+    known = np.isfinite(z)
+    local = rays(depth.K, shared.uv_a[known]) * z[known, None]
+    return se3.transform(depth.T_world_camera, local), shared.uv_b[known]
 
 
 def _features(bgr: U8) -> Features:

@@ -69,6 +69,7 @@ FIGURES = (
     ("PSNR", 1.0, "dB"),
     ("SSIM", 1.0, ""),
     ("PSNR on grids", 1.0, "dB"),
+    ("PSNR as exposed", 1.0, "dB"),
 )
 """As view_scoring.FrameScore has them."""
 

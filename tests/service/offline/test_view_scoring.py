@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from recon import se3
 from recon.camera_model import rays, scaled
 from recon.surface.raster import Grid, Raster
-from recon.types import F64, U8, Bool, Camera
+from recon.types import F64, U8, Bool, Camera, Keyframe
 from service.cli import app
 from service.errors import InputError
 from service.offline.exports.view import ScanView
@@ -188,3 +188,27 @@ def test_a_still_is_placed_however_much_finer_than_the_keyframes_it_is(
     assert T is not None
     off_m = np.linalg.norm(T[:3, 3] - seen.depth.T_world_camera[:3, 3])
     assert off_m < 0.01 * float(np.nanmedian(seen.depth.depth_m))
+
+
+def test_a_still_between_two_strips_is_placed_by_both(house: HouseFlight) -> None:
+    """What its own strip shows first is a stripe at the edge, whose depth is off."""
+    far = [house.keyframe(k, 4.0 + 0.1 * k) for k in range(12)]
+    flown = [house.keyframe(k, 0.8 * k) for k in range(12)]
+    stripe = np.zeros(far[0].fresh.shape, np.bool_)
+    stripe[:, :60] = True
+    near = [
+        replace(k, time_ns=k.time_ns + 10**12, fresh=stripe, depth=k.depth.scaled(1.1, pose(k)))
+        for k in flown
+    ]
+    still = house.keyframe(7, 4.5)
+    camera = Camera(house.K, np.zeros(5), (still.bgr.shape[1], still.bgr.shape[0]))
+    off_m = []
+    for keyframes in (near, [*far, *near]):
+        T = placed(still.bgr, near[7].time_ns, keyframes, camera)
+        assert T is not None
+        off_m.append(np.linalg.norm(T[:3, 3] - pose(still)[:3, 3]))
+    assert off_m[1] < 0.25 and off_m[0] > 1.0
+
+
+def pose(keyframe: Keyframe) -> F64:
+    return keyframe.depth.T_world_camera
