@@ -40,7 +40,7 @@ CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", 
 DESK = {
     "maps": ("rasterio",),
     "clouds": ("copclib", "py3dtiles"),
-    "meshes": ("trimesh", "open3d"),
+    "meshes": ("open3d", "fast_simplification"),
     "recordings": ("foxglove", "rosbags", "mcap"),
     "flight logs": ("pyulog",),
     "portal": ("starlette", "uvicorn", "websockets"),
