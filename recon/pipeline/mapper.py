@@ -207,7 +207,7 @@ class Mapper:
         self.keyframes = KeyframeMap(trajectory, loops, backend, self.rejected, timing)
         self.surface = SurfaceMap(trajectory.similarities, config.resolution_m, new_map)
         self.exposure = ExposureCompensation()
-        self.frames = FramePoses(self.keyframes, self.is_settled)
+        self.frame_poses = FramePoses(self.keyframes, self.is_settled)
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
         self._ready = set[int]()  # numbers of all keyframes that are given out
         self._worker = worker(self.reconstruct)
@@ -261,7 +261,7 @@ class Mapper:
         return (*placed, *done, self._posed(tracked, is_view))
 
     def _posed(self, frame: Frame, is_view: bool) -> FramePosed:
-        return FramePosed(frame.without_images(), self.frames.place(frame), is_view)
+        return FramePosed(frame.without_images(), self.frame_poses.place(frame), is_view)
 
     def locate(self, frame: Frame) -> list[Frame]:
         """The frame with its pose by the odometry, or why there is none; before it the last one,
@@ -366,13 +366,13 @@ class Mapper:
         finally:
             self._worker.close()
             self.reset_map()
-        self.frames.finish()
+        self.frame_poses.finish()
         return (*events, *self._changed(self.keyframes.trajectory.moved(final=True)))
 
     def _finished(self, everything: bool = False) -> Iterator[Event]:
         for view, (pose, events) in self._worker.finished(everything):
             if pose is not None:
-                self.frames.add_view(view.frame, pose)
+                self.frame_poses.add_view(view.frame, pose)
             for event in events:
                 if isinstance(event, PosesChanged):
                     yield from self._changed(event.poses)
@@ -382,7 +382,7 @@ class Mapper:
                     if self._kept is not None:
                         self._kept[view.seq] = event.keyframe
                 yield event
-        self.frames.settle()
+        self.frame_poses.settle()
 
     def _changed(self, poses: Mapping[int, Pose]) -> Iterator[PosesChanged]:
         # A view whose work was broken off is in the graph, and no keyframe.

@@ -142,10 +142,10 @@ def _measured(nodes: Sequence[Node], start: Alignment, slow_share: float) -> Rea
         at = _solve(fixes, at, SETTLED_START).at
         out = _of_fixes(fixes, at, slow_share)
         fixes = AlignmentReadings(fixed, out)
-    ways = AlignmentReadings(moved)
-    if len(ways.way) >= MIN_READINGS:
-        drift = ways.velocity_residuals(_solve(ways, start, SETTLED_START).at)
-        found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
+    moves = AlignmentReadings(moved)
+    if len(moves.travel_m) >= MIN_READINGS:
+        drift = moves.velocity_residuals(_solve(moves, start, SETTLED_START).at)
+        found = drift_noise(np.cumsum(moves.travel_s), np.cumsum(drift, axis=0))
         if found is not None:
             # A steady error along a leg looks like another scale: no residual shows it.
             hidden = Noise(0.0, found[1], RATE_S).reach(USUAL_RATE_M_S, MIN_BIAS)
@@ -202,9 +202,9 @@ def _of_fixes(fixes: AlignmentReadings, at: Alignment, slow_share: float) -> Rea
 
 def _velocities_contradict(readings: AlignmentReadings) -> bool:
     """True when velocities and fixes give lengths of the flight that no noise explains."""
-    if len(readings.way) == 0 or len(readings.fix) < 2:
+    if len(readings.travel_m) == 0 or len(readings.fix) < 2:
         return False
-    flown = float(np.linalg.norm(readings.way.sum(axis=0)))
+    flown = float(np.linalg.norm(readings.travel_m.sum(axis=0)))
     fixed = float(np.linalg.norm(readings.fix[-1] - readings.fix[0]))
     slack = 3.0 * float(np.max(readings.claimed)) + 0.2 * max(flown, fixed)
     return abs(flown - fixed) > slack

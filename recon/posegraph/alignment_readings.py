@@ -27,7 +27,7 @@ KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
 """Sigma below which a heading counts as known, and one of a heading that is not."""
 
 USUAL_RATE_M_S, RATE_S = 0.05, 20.0  # slow part of a velocity's error: sigma and time constant
-MIN_WAY_S = 1e-3  # time that no way by velocity is shorter than
+MIN_TRAVEL_S = 1e-3  # no travel by velocity is shorter
 UNKNOWNS = 11  # rotation, shift and log scale; an assumed view's mount and the drift of altitudes
 AXES = (slice(0, 2), slice(2, 3))  # those of a position that err alike: horizontal and vertical
 LEVEL_SIGMAS = 3.0  # so many of an attitude's by which it and fixes differ on what is level
@@ -148,7 +148,7 @@ class AlignmentReadings:
     def __init__(self, nodes: Sequence[Node], noise: ReadingNoise | None = None) -> None:
         turned = [a for a in nodes if a.prior.R_world_camera is not None]
         fixed = [a for a in nodes if has_fix(a.prior)]
-        moved = [(a, b, w) for a, b in pairwise(nodes) if (w := _way(a.prior, b.prior))]
+        moved = [(a, b, w) for a, b in pairwise(nodes) if (w := _travelled(a.prior, b.prior))]
         heights, independent = height_ratios(nodes)
         noise = noise or ReadingNoise()
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
@@ -173,10 +173,10 @@ class AlignmentReadings:
         self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
         self.sigma_fix, self.fix_noise = noise.of_fixes(self.claimed)
         self.step = _stack([b.place - a.place for a, b, _ in moved], (3,))  # by vision
-        self.way = _stack([metres for *_, (metres, _) in moved], (3,))  # the same by velocity
-        self.way_s = np.maximum(_stack([s for *_, (_, s) in moved], ()), MIN_WAY_S)
-        self.way_end_s = _stack([b.time_s for _, b, _ in moved], ())
-        self.sigma_speed = noise.of_travels(self.way_s)
+        self.travel_m = _stack([metres for *_, (metres, _) in moved], (3,))  # the same by velocity
+        self.travel_s = np.maximum(_stack([s for *_, (_, s) in moved], ()), MIN_TRAVEL_S)
+        self.travel_end_s = _stack([b.time_s for _, b, _ in moved], ())
+        self.sigma_speed = noise.of_travels(self.travel_s)
         self._slow = Noise(0.0, noise.rate_m_s, RATE_S)
         self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
         self.has_heights = any(sigma < GUESSED_SHARE for _, sigma in heights)
@@ -190,19 +190,19 @@ class AlignmentReadings:
         """(M,) the group of each row."""
         known = 1.0 / self.sigma_turn
         known[~self.heading_known, 2] = 0.0
-        way = np.repeat(1.0 / (self.sigma_speed * self.way_s), 3)
+        travel = np.repeat(1.0 / (self.sigma_speed * self.travel_s), 3)
         self._whitening = np.concatenate(
-            [known.ravel(), 1.0 / self.sigma_fix.ravel(), way, 1.0 / self.sigma_log,
+            [known.ravel(), 1.0 / self.sigma_fix.ravel(), travel, 1.0 / self.sigma_log,
              1.0 / self._sigma_common(turned)]
         )  # fmt: skip
         self.of_fixes = slice(len(turned), len(turned) + len(fixed))
         """Groups of the fixes."""
-        self.of_ways = slice(self.of_fixes.stop, three)
-        """Groups of the ways."""
+        self.of_travels = slice(self.of_fixes.stop, three)
+        """Groups of the travels."""
         self._turned, self._fixed = 3 * len(turned), 3 * len(fixed)
         self._rows = slice(self._turned, self._turned + self._fixed)  # of the fixes
         self._scaled = slice(self._turned, 3 * three)
-        self._moved = slice(self._rows.stop, 3 * three)  # of the ways
+        self._moved = slice(self._rows.stop, 3 * three)  # of the travels
         self._J = np.zeros((len(self.group), UNKNOWNS))  # where it is constant
         self._J[: self._turned, :3] = np.tile(np.eye(3), (len(turned), 1))
         self._J[self._rows, 3:6] = np.tile(np.eye(3), (len(fixed), 1))
@@ -244,16 +244,16 @@ class AlignmentReadings:
 
     def linearised(self, at: Alignment) -> tuple[F64, F64]:
         """Whitened residuals (M,) and Jacobian (M, UNKNOWNS)."""
-        fix, way = self.fix_residuals(at), self.velocity_residuals(at)
+        fix, travel = self.fix_residuals(at), self.velocity_residuals(at)
         turn, of_mount = self.attitude_residuals(at)
         J = self._J.copy()
         drifted = np.outer(self.time_share * at.drift_m, [0.0, 0.0, 1.0])
-        y = np.concatenate([fix + self.fix - drifted - at.t, way + self.way])
+        y = np.concatenate([fix + self.fix - drifted - at.t, travel + self.travel_m])
         of = J[self._scaled].reshape(-1, 3, UNKNOWNS)
         of[:, :, :3], of[:, :, 6] = -se3.hat(y), y
         J[: self._turned, 7:10] = of_mount.reshape(-1, 3)
         height, common = np.log(at.scale) - self.log_ratio, np.r_[at.mount_rad, at.drift_m]
-        r = np.concatenate([turn.ravel(), fix.ravel(), way.ravel(), height, common])
+        r = np.concatenate([turn.ravel(), fix.ravel(), travel.ravel(), height, common])
         return r * self._whitening, J * self._whitening[:, None]
 
     def information(self, extra: F64) -> list[F64]:
@@ -284,16 +284,16 @@ class AlignmentReadings:
             np.einsum("ij,jak->iak", P, fixes[:, axes]) for axes, P in zip(AXES, known, strict=True)
         ]
         out[self._rows] = np.concatenate(parts, axis=1).reshape(-1, rows.shape[1])
-        out[self._moved] = self._weighted_ways(rows[self._moved], weight[self.of_ways])
+        out[self._moved] = self._weighted_travels(rows[self._moved], weight[self.of_travels])
         return out
 
-    def _weighted_ways(self, rows: F64, weight: F64) -> F64:
+    def _weighted_travels(self, rows: F64, weight: F64) -> F64:
         """Whitened rows (3 k, c) times the inverse of their covariance: a velocity's slow error
         adds up. An outlier of a ``weight`` (k,) below 1 gets a variance of its own."""
         sigma = self.sigma_speed[:, None]
         own = self.sigma_speed**2 / np.maximum(weight, TINY) - self._slow.bias**2
-        ways = sigma * rows.reshape(len(sigma), 3 * rows.shape[1])
-        return (sigma * self._slow.weighted(self.way_end_s, own, ways)).reshape(rows.shape)
+        travels = sigma * rows.reshape(len(sigma), 3 * rows.shape[1])
+        return (sigma * self._slow.weighted(self.travel_end_s, own, travels)).reshape(rows.shape)
 
     def variance_factor(self, r: F64, weighted: F64, kept: Bool) -> float:
         """Variance factor of the fixes by residuals (M,), the same ``weighted``, and which groups
@@ -307,8 +307,8 @@ class AlignmentReadings:
         return np.asarray(at.scale * self.x @ at.R.T + at.t + drifted - self.fix)
 
     def velocity_residuals(self, at: Alignment) -> F64:
-        """(k, 3) m from ways by velocity to those by vision."""
-        return np.asarray(at.scale * self.step @ at.R.T - self.way)
+        """(k, 3) m from travels by velocity to those by vision."""
+        return np.asarray(at.scale * self.step @ at.R.T - self.travel_m)
 
     def attitude_residuals(self, at: Alignment) -> tuple[F64, F64]:
         """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone. And
@@ -345,7 +345,7 @@ def from_middle(time_s: float | F64, middle_s: float, half_s: float) -> F64:
     return np.asarray(np.clip((time_s - middle_s) / half_s, -1.0, 1.0))
 
 
-def _way(a: PosePrior, b: PosePrior) -> tuple[F64, float] | None:
+def _travelled(a: PosePrior, b: PosePrior) -> tuple[F64, float] | None:
     """(3,) m flown by velocity between two priors, and the seconds; None where it was not
     integrated from one to the other without a gap."""
     one, two = a.travel, b.travel

@@ -288,7 +288,7 @@ class GraphFactors:
         ratio, log = height_ratio(node), np.log(self._segments[node.segment].to_world.scale)
         if ratio is None or not node.prior.is_agl_measured:
             return False
-        if node.lean == 0.0 and abs(ratio[0] - log) > HEIGHT_GATE:
+        if node.slant == 0.0 and abs(ratio[0] - log) > HEIGHT_GATE:
             self.left_out["height off"] += 1  # a tree or a roof under the one sensor alone
             return False
         sigma = ratio[1] * float(np.sqrt(BLOCK * BLOCKS_PER_HEIGHT))

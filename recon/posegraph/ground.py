@@ -21,7 +21,7 @@ UNMEASURED_HEIGHTS = 1.0
 
 GUESSED_SHARE = 0.5  # relative sigma of an assumed height, which holds an otherwise unknown scale
 EXACT_HEIGHTS = 16.0  # the same where the ground exactly below was measured: relief has no part
-LEANING_SHARE = 2.0  # sigma of a height, as a share, per unit of (1 - cosine) off the vertical
+SLANT_SHARE = 2.0  # sigma of a height, as a share, per unit of (1 - cosine) off the vertical
 MIN_EXACT = 4  # heights exactly below from which on no others count
 MIN_SPREAD = 0.005  # share of a height by which readings of one flight may always differ
 EDGE_SHARE = 0.03  # depths about the point below that differ by more belong to an edge
@@ -78,7 +78,7 @@ def height_ratio(node: Node) -> tuple[float, float] | None:
     if agl is None or height is None or not height > 0:
         return None
     # The height is measured straight below; ground seen elsewhere may lie otherwise.
-    sigma = node.prior.sigma_agl_m / agl + LEANING_SHARE * node.lean
+    sigma = node.prior.sigma_agl_m / agl + SLANT_SHARE * node.slant
     return float(np.log(agl / height)), sigma
 
 
@@ -89,7 +89,7 @@ def height_ratios(nodes: Sequence[Node]) -> tuple[list[tuple[float, float]], flo
     measured = [(h, n) for h, n in known if n.prior.is_agl_measured]
     if not measured:
         return [h for h, _ in known], UNMEASURED_HEIGHTS
-    exact = [h for h, n in measured if n.lean == 0.0]
+    exact = [h for h, n in measured if n.slant == 0.0]
     if len(exact) < MIN_EXACT:
         return [h for h, _ in measured], INDEPENDENT_HEIGHTS
     # A rangefinder meets a tree where the image sees through it: single ones are far off.

@@ -80,10 +80,10 @@ class PoseGraph:
             prior: telemetry at this moment; parts may be missing.
             height: above ground as :func:`recon.posegraph.ground.height_above` gives it.
         """
-        above, lean = height if height is not None else (None, 0.0)
+        above, slant = height if height is not None else (None, 0.0)
         node = Node(
             seq, len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
-            np.array(covariance, np.float64), self._fresh(sound(prior)), above, lean,
+            np.array(covariance, np.float64), self._fresh(sound(prior)), above, slant,
         )  # fmt: skip
         last = self._newest() if self._nodes else None
         self.entered += 1

@@ -20,7 +20,7 @@ class Node:
     covariance: F64  # (6, 6) of the motion since the node before, left, in that camera's frame
     prior: PosePrior
     height: float | None = None  # above the ground that it sees, in odometry units
-    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
+    slant: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
     weight: int = 1  # keyframes since the node before, this one among them
 
     @property

@@ -101,7 +101,7 @@ class Segment:
         camera."""
         prior = self.constants.without(node.prior)
         if self.offsets is not None:
-            prior = self.offsets.without(prior, node.time_s, node.lean)
+            prior = self.offsets.without(prior, node.time_s, node.slant)
         return self.at_camera(replace(node, prior=prior))
 
     def at_camera(self, node: Node) -> PosePrior:

@@ -68,8 +68,8 @@ class Offsets:
     reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
     is_exact: bool = False  # only heights of the ground exactly below count
 
-    def without(self, prior: PosePrior, time_s: float, lean: float = 0.0) -> PosePrior:
-        """A prior without them; ``lean`` is that of the ground whose height vision measures."""
+    def without(self, prior: PosePrior, time_s: float, slant: float = 0.0) -> PosePrior:
+        """A prior without them; ``slant`` is that of the ground whose height vision measures."""
         R, position, agl = prior.R_world_camera, prior.position_m, prior.agl_m
         if R is not None:
             R = R @ se3.so3_exp(self.at.mount_rad) if prior.is_view_assumed else R
@@ -81,7 +81,7 @@ class Offsets:
             off = off * min(1.0, self.reach_m / max(float(np.linalg.norm(off)), 1e-9))
             position = position + self.shift_m + self.warp @ off
         if agl is not None:
-            is_relief = self.is_exact and lean > 0.0
+            is_relief = self.is_exact and slant > 0.0
             agl = None if is_relief else agl * float(np.exp(self.log_height))
         return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
 

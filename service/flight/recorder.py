@@ -197,7 +197,7 @@ class Recorder:
             )  # fmt: skip
             published = pose_at(T, T[:3, 3], np.full(3, before_m / 3**0.5))
             record = self._record(
-                time_ns, self.mapper.frames.pose(frame, published),
+                time_ns, self.mapper.frame_poses.pose(frame, published),
                 None if math.isnan(agl_m) else agl_m, seq if row["is_view"] else None,
             )  # fmt: skip
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - T[:3, 3])

@@ -46,9 +46,9 @@ def landed(trajectory: Trajectory, count: int) -> F64:
 
 
 def node(
-    T_odom_camera: F64, prior: PosePrior, height: float | None = None, lean: float = 0.0,
+    T_odom_camera: F64, prior: PosePrior, height: float | None = None, slant: float = 0.0,
     time_s: float = 0.0,
 ) -> Node:  # fmt: skip
     """A keyframe with its telemetry, of no graph."""
     time_ns = round(1e9 * time_s)
-    return Node(0, 0, time_ns, 0, T_odom_camera, np.zeros((6, 6)), prior, height, lean)
+    return Node(0, 0, time_ns, 0, T_odom_camera, np.zeros((6, 6)), prior, height, slant)

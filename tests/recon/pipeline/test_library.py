@@ -216,5 +216,5 @@ def test_a_first_depth_is_said_and_becomes_no_part_of_the_map() -> None:
     assert isinstance(event, KeyframeReady) and event.is_first_depth
     assert len(mapper.cloud()) == 0
     frame = view_at(9, np.eye(4)).frame
-    pose = mapper.frames.place(frame)
+    pose = mapper.frame_poses.place(frame)
     assert pose is not None and pose.sources == ("vision",) and not pose.is_aligned

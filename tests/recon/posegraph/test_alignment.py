@@ -302,8 +302,8 @@ def test_heights_exactly_below_count_alone() -> None:
     for i, a in enumerate(noisy_nodes(np.eye(3), 3.0, np.zeros(3), seed=4)):
         p = a.prior
         prior = PosePrior(p.R_world_camera, 0.01, 0.05, None, None, 60.0, 2.0)
-        lean, error = (0.0, 1.0) if i % 3 == 0 else (0.02, 1.1)
-        some.append(node(a.T_odom_camera, prior, 20.0 * error, lean))
+        slant, error = (0.0, 1.0) if i % 3 == 0 else (0.02, 1.1)
+        some.append(node(a.T_odom_camera, prior, 20.0 * error, slant))
     found = fit(some)
     assert found is not None
     assert found.scale == pytest.approx(3.0, rel=0.001)

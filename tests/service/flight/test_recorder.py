@@ -74,7 +74,7 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
 
     pipeline = MagicMock()
     pipeline.mapper.keyframes.graph = graph
-    pipeline.mapper.frames.pose = at
+    pipeline.mapper.frame_poses.pose = at
     pipeline.mapper.is_settled.return_value = False
     return Recorder(store, pipeline, Mock(Rig, local_frame=None, georeference="none"), batch=batch)
 
