@@ -157,7 +157,7 @@ def test_the_scale_names_what_measured_it(
     covariance = np.diag([0.0] * 6 + [sigma**2])
     found = Alignment(1.0, np.eye(3), np.zeros(3), covariance, sources)
     graph = Mock(PoseGraph, segments=Mock(Segments))
-    graph.segments.largest.return_value.frame = found
+    graph.segments.largest.return_value.to_world = found
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("s", "drone", 0)) as store:
         recorder = recorder_of(store, 1, 0.1, graph)
 
