@@ -49,12 +49,19 @@ print(sum(inner.stats.cache_hits.values()), library._shared_module is None, rtsy
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_from_the_cache_is_unpacked_for_one_that_calls_it(tmp_path: Path) -> None:
     said = cached(tmp_path)
     assert said(BOTH) == ["1", "True", "17"]
 
 
-@pytest.mark.parametrize("version", ["0.59.1", "0.68.0", "1.63.1", "0+untagged"])
+OTHERS = [
+    "0+untagged",
+    *(pytest.param(v, marks=pytest.mark.slow) for v in ("0.59.1", "0.68.0", "1.63.1")),
+]
+
+
+@pytest.mark.parametrize("version", OTHERS)
 def test_another_numba_loads_kernels_its_own_way(tmp_path: Path, version: str) -> None:
     said = cached(tmp_path)
     assert said(OTHER_NUMBA.replace("VERSION", repr(version))) == ["1", "False", "True"]

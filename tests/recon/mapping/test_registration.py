@@ -146,7 +146,7 @@ def test_forward_and_backward_to_a_centimetre(kind: str, shift_m: float) -> None
         ("hills", 0.05, 0.0),
         ("hills", 0.15, 2.0),
         pytest.param("houses", 0.05, 0.0, marks=pytest.mark.slow),
-        ("houses", 0.06, 1.5),
+        pytest.param("houses", 0.06, 1.5, marks=pytest.mark.slow),
     ],
 )
 def test_reported_covariance_holds(kind: str, sigma_m: float, blur_px: float) -> None:

@@ -146,6 +146,7 @@ def test_altitudes_that_drift_by_100_m_level_nothing() -> None:
     assert found.drift_m == pytest.approx(50.0, abs=5.0)
 
 
+@pytest.mark.slow
 def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
     flown = stills(4, 4.0, turns=True, drift_m=50.0)
     trajectory = settled(flown)

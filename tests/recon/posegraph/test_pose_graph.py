@@ -623,6 +623,7 @@ def tied_stretch(
     return se3.transform(se3.inverse(graph.poses()[4]), graph.poses()[before:, :3, 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("compass_rad", "tilt_rad"), [(0.15, 0.0), (0.0, 0.05)])
 def test_a_stretch_that_loops_tie_is_not_bent_by_what_is_constant_in_its_attitudes(
     compass_rad: float, tilt_rad: float
@@ -632,6 +633,7 @@ def test_a_stretch_that_loops_tie_is_not_bent_by_what_is_constant_in_its_attitud
     assert np.linalg.norm(places - truth, axis=1).max() < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grown", [8, 45])
 def test_a_stretch_that_loops_tie_learns_the_mount_by_its_turns(grown: int) -> None:
     """It would be off by 18 metres, were the mount again taken to be as assumed, and by 25, were

@@ -57,6 +57,7 @@ def test_replay_refuses_a_view_that_is_too_narrow(tmp_path: Path) -> None:
     assert "the view is 1.4 degrees wide" in ended.stderr
 
 
+@pytest.mark.slow
 def test_a_stopped_simulation_leaves_nothing(tmp_path: Path) -> None:
     place = tmp_path / "place"
     place.mkdir()

@@ -111,6 +111,7 @@ def test_another_shape_of_a_live_stream_begins_another_scan(tmp_path: Path) -> N
             assert warned[height] in " ".join(summary["warnings"]) and "interrupted" not in summary
 
 
+@pytest.mark.slow
 def test_a_fault_after_another_shape_does_not_make_it_unfit(tmp_path: Path) -> None:
     """The camera is opened again, and still gives that shape."""
     first, later = ((20, (320, 240)), (20, (320, 180))), ((1000, (320, 180)),)

@@ -146,6 +146,7 @@ def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(tmp_p
         assert not ground.workers.failed
 
 
+@pytest.mark.slow
 def test_a_drone_that_answers_no_request_gets_few_threads(tmp_path: Path) -> None:
     """It names ever new scans, for whose headers it is asked."""
     kept: list[Any] = []

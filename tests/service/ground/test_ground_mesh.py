@@ -42,6 +42,7 @@ def portal_of(folder: Path, growing: list[dict[str, Any]], **options: Any) -> Po
     return Portal(config, lambda: growing)
 
 
+@pytest.mark.slow
 def test_a_scan_that_has_ended_gets_its_mesh_when_no_other_grows(folder: Path) -> None:
     other = {"drone": "drone-2", "scan": "b", "finished": False, "heard_unix_s": time.time() + 60}
     growing = [other]
@@ -90,6 +91,7 @@ def test_nothing_is_made_where_nobody_wants_it_or_it_does_not_fit(
     assert not portal.jobs.of(folder)
 
 
+@pytest.mark.slow
 def test_meshes_that_did_not_fit_or_were_cut_off_are_made_later(
     folder: Path, tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -168,6 +168,7 @@ def test_products_that_are_folders_come_as_a_zip(portal: Portal, tmp_path: Path)
     assert [client.ask(f"{ONE}/{name}.zip")[0] for name in ("mesh-obj", "tokens")] == [404, 404]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
 def test_a_folder_is_downloaded_from_the_page(
     browser: Browser, portal: Portal, tmp_path: Path, needs: None

@@ -61,6 +61,7 @@ def errors_m(site: Path, first: int, truth: list[F64]) -> F64:
     return np.array(out)
 
 
+@pytest.mark.slow
 def test_three_points_and_the_surface_place_a_scan(
     scans: tuple[Path, Path], tmp_path: Path
 ) -> None:

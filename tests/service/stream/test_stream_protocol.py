@@ -154,7 +154,8 @@ class World:
 
 
 @pytest.mark.parametrize(
-    ("loss", "cut"), [(0.0, (0.0, 0.0)), (0.1, (4.0, 24.0)), (0.25, (0.0, 9.0))]
+    ("loss", "cut"),
+    [(0.0, (0.0, 0.0)), (0.1, (4.0, 24.0)), pytest.param(0.25, (0.0, 9.0), marks=pytest.mark.slow)],
 )
 def test_everything_arrives_over_a_bad_link_and_within_the_budget(
     tmp_path: Path, loss: float, cut: tuple[float, float]
