@@ -1,9 +1,11 @@
 """A finished scan adjusted by its own images: ``refine --video FLIGHT``.
 
 The keyframes' images, and those that hold marks of surveyed points, are matched again at full
-size. One adjustment has their poses, the places seen, the camera (if observable), the telemetry
-and the surveyed points in it. Depth images stay as they are; each is scaled to
-the places that it shows.
+size. One adjustment has their poses, the places seen, the telemetry and the surveyed points in it.
+Depth images and textures keep the camera that the scan was flown with, so poses are those of that
+camera: of another one, its centre moved by a pixel, they would lie pixels apart where strips are
+flown both ways. The camera that fits the images best (if observable) is found beside them. Each
+depth image is scaled to the places that it shows.
 """
 
 from __future__ import annotations
@@ -62,8 +64,7 @@ class ImageNetwork:
 
     keyframes: int
     given: Camera
-    camera: Camera  # found, or the one given
-    held: F64  # (8, 8) information of the one given
+    camera: Camera  # that fits the images best, or the one given; the poses are of the one given
     poses: F64  # (V, 4, 4) T_world_camera: those of the keyframes, then of other marked frames
     points: F64  # (P, 3)
     seen: Sightings
@@ -117,22 +118,27 @@ def network_of(
     poses = np.array([*states.poses, *(f.T_world_camera for f in marked)])
     images = own_camera.images_at(video, header.started_unix_ns, times)
     ground_m = float(np.median((poses[:, :3, 3] + ahead_m * poses[:, :3, 2])[:, 2]))
-    tied = own_camera.sightings(images, given, poses, ground_m)
-    known = loosely_placed(poses, tied.seen)
-    held = camera_information(given, FREE)
-    found = network(given, tied.poses, tied.seen, known, held, near=tied.camera)
+    return fitted(given, poses, own_camera.sightings(images, given, poses, ground_m), len(states))
+
+
+def fitted(
+    given: Camera, poses: F64, tied: own_camera.TiedViews, keyframes: int,
+    config: SelfCalibrationConfig = FREE,
+) -> ImageNetwork:  # fmt: skip
+    """The network of views that are ``tied``, and the camera that fits them best.
+
+    Raises ValueError where too few sightings agree.
+    """
+    known, free = loosely_placed(poses, tied.seen), camera_information(given, config)
+    found = network(given, tied.poses, tied.seen, known, free, near=tied.camera)
     s, pixel = found.solution, np.full(len(found.seen.view), found.sigma_px)
-    settled = Problem(s.camera, given, s.poses, s.points, found.seen, pixel, known, held)
+    settled = Problem(s.camera, given, s.poses, s.points, found.seen, pixel, known, free)
     sigmas = camera_sigmas(s.camera_covariance) * np.sqrt(max(dispersion(settled), 1.0))
-    focal = focal_sigma(s.camera, sigmas)
-    why = doubt(s.camera, given, sigmas, FREE)
-    if why:
-        held = camera_information(given, HELD)
-        found = network(given, tied.poses, tied.seen, known, held)
+    focal, why = focal_sigma(s.camera, sigmas), doubt(s.camera, given, sigmas, config)
+    camera = given if why else s.camera
+    found = network(given, tied.poses, tied.seen, known, camera_information(given, HELD))
     s = found.solution
-    return ImageNetwork(
-        len(states), given, s.camera, held, s.poses, s.points, found.seen, focal, why
-    )
+    return ImageNetwork(keyframes, given, camera, s.poses, s.points, found.seen, focal, why)
 
 
 def marked_frames(
@@ -212,14 +218,14 @@ def adjusted(
         seen = Sightings(np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), at_px)
     try:
         found = network(
-            images.given, images.poses, images.seen, known, images.held, seen, MARK_PX, True,
-            near=images.camera,
+            images.given, images.poses, images.seen, known,
+            camera_information(images.given, HELD), seen, MARK_PX, True, near=images.given,
         )  # fmt: skip
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         raise InputError(f"the images do not tie the scan together ({error})") from error
     s = found.solution
     scales = depth_scales(images, s.poses, s.points, found.seen, surface)
-    after = replace(images, camera=s.camera, poses=s.poses, seen=found.seen)
+    after = replace(images, poses=s.poses, seen=found.seen)
     return Adjusted(s.poses[:n], s.covariances[:n], scales, _residuals(found, known), ()), after
 
 
