@@ -252,11 +252,11 @@ def poses_at(times_s: F64, poses: F64, at_s: F64) -> tuple[F64, Bool]:
     known &= step <= 5.0 * max(float(np.median(np.diff(times_s))), 1e-6)
     share = np.clip((at_s - times_s[left]) / np.maximum(step, 1e-9), 0.0, 1.0)
     out = np.tile(np.eye(4), (len(at_s), 1, 1))
-    for k in np.flatnonzero(known):
-        a, b = poses[left[k]], poses[right[k]]
-        turn = se3.so3_log(a[:3, :3].T @ b[:3, :3])
-        out[k, :3, :3] = a[:3, :3] @ se3.so3_exp(share[k] * turn)
-        out[k, :3, 3] = (1 - share[k]) * a[:3, 3] + share[k] * b[:3, 3]
+    a, b, part = poses[left[known]], poses[right[known]], share[known, None]
+    R = a[:, :3, :3]
+    turn = se3.each_so3_log(R.transpose(0, 2, 1) @ b[:, :3, :3])
+    out[known, :3, :3] = R @ se3.each_so3_exp(part * turn)
+    out[known, :3, 3] = (1 - part) * a[:, :3, 3] + part * b[:, :3, 3]
     return out, np.asarray(known)
 
 

@@ -30,6 +30,7 @@ EDGE_PRECISION = 1.25
 SPARSE_CELLS = 8
 SPARSE_SHARE = 0.5
 
+SMOOTH_CELLS = 1.5
 BAND_ROWS = 128
 LARGEST_CELLS = 200_000_000
 
@@ -284,16 +285,14 @@ def without_cells(raster: Raster, unknown: Bool) -> Raster:
     return replace(raster, height_m=height, sigma_m=spread, rgb=rgb)
 
 
-def standing_height(raster: Raster, reach_m: float = 2.0, share: float = 0.99) -> float:
-    """Height of objects on this ground: the quantile ``share`` of the heights above the lowest
-    known cell within ``reach_m``. 0 where nothing is known.
-    """
+def standing_height(raster: Raster) -> float:
+    """Height of objects on this ground: 99 % of the known cells are no higher above the lowest one
+    within 2 m. 0 where nothing is known."""
     known = raster.known
     if not known.any():
         return 0.0
-    reach = max(1, round(reach_m / raster.grid.cell_m))
-    low = highest_lowest(raster.height_m, reach)[1]
-    return float(np.quantile((raster.height_m - low)[known], share))
+    low = highest_lowest(raster.height_m, max(1, round(2.0 / raster.grid.cell_m)))[1]
+    return float(np.quantile((raster.height_m - low)[known], 0.99))
 
 
 def highest_lowest(height_m: F32, reach_cells: int) -> tuple[F32, F32]:
@@ -355,7 +354,7 @@ def _fill(
                 break
 
 
-def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
+def smoothed(raster: Raster) -> Raster:
     """``raster`` with noise taken out of its heights and steps kept.
 
     A median over 5x5 cells, which also joins surfaces of two keyframes that interleave, then
@@ -368,18 +367,18 @@ def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
     middle = np.float32(np.median(raster.height_m[known]))
     out = np.empty_like(raster.height_m)
     for band, own in _bands(len(out), margin=8):
-        out[band][own] = _smoothed(raster.height_m[band] - middle, tolerance, sigma_cells)[own]
+        out[band][own] = _smoothed(raster.height_m[band] - middle, tolerance)[own]
     out += middle
     return replace(raster, height_m=out)
 
 
-def _smoothed(height_m: F32, tolerance_m: float, sigma_cells: float) -> F32:
+def _smoothed(height_m: F32, tolerance_m: float) -> F32:
     known = np.isfinite(height_m)
     far = np.float32(1e6)
     height = np.where(known, height_m, far)
     median = cv2.medianBlur(height, 5)
     np.copyto(height, median, where=known & (median < 0.5 * far))
-    smooth = cv2.bilateralFilter(height, -1, tolerance_m, sigma_cells)
+    smooth = cv2.bilateralFilter(height, -1, tolerance_m, SMOOTH_CELLS)
     smooth[~known] = np.nan
     return np.asarray(smooth)
 
@@ -394,25 +393,21 @@ def _bands(rows: int, margin: int) -> Iterator[tuple[slice, slice]]:
         yield slice(first, top + BAND_ROWS + margin), slice(top - first, top - first + BAND_ROWS)
 
 
-def hillshade(
-    height_m: F32, cell_m: float, azimuth_deg: float = 315.0, elevation_deg: float = 45.0
-) -> F32:
-    """(rows, cols) brightness 0 to 1 of the surface lit by a distant sun; NaN where unknown.
+SUN = (-0.5, 0.5, math.sqrt(0.5))
+"""East, north and up to the light: in the north-west, halfway up the sky."""
+
+
+def hillshade(height_m: F32, cell_m: float) -> F32:
+    """(rows, cols) brightness 0 to 1 of the surface lit by the SUN; NaN where unknown.
 
     Lambertian shading of the surface normal (Horn 1981, doi:10.1109/PROC.1981.11918), with
     slopes from differences to the known neighbours.
     """
-    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    sun = (
-        math.sin(azimuth) * math.cos(elevation),
-        math.cos(azimuth) * math.cos(elevation),
-        math.sin(elevation),
-    )
     out = np.empty(height_m.shape, np.float32)
     for band, own in _bands(len(out), margin=1):
         dz_east = _slope(height_m[band], axis=1) / cell_m
         dz_north = -_slope(height_m[band], axis=0) / cell_m
-        dot = -dz_east * sun[0] - dz_north * sun[1] + sun[2]
+        dot = -dz_east * SUN[0] - dz_north * SUN[1] + SUN[2]
         shade = np.clip(dot / np.sqrt(1.0 + dz_east**2 + dz_north**2), 0.0, 1.0)
         out[band][own] = shade[own]
     out[~np.isfinite(height_m)] = np.nan

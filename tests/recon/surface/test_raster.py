@@ -154,7 +154,7 @@ def test_shading_of_a_plane_is_the_cosine_to_the_sun(east: float, north: float) 
     rows, cols = np.mgrid[0:20, 0:30].astype(float)
     cell = 0.5
     height = (east * cols * cell - north * rows * cell).astype(np.float32)
-    shade = hillshade(height, cell, azimuth_deg=315.0, elevation_deg=45.0)
+    shade = hillshade(height, cell)
     normal = np.array([-east, -north, 1.0]) / math.sqrt(1 + east**2 + north**2)
     h = math.sqrt(0.5)
     sun = np.array([-math.sqrt(0.5) * h, math.sqrt(0.5) * h, h])
