@@ -84,6 +84,11 @@ class Grid:
             self.cell_m, (rows.stop - rows.start, cols.stop - cols.start),
         )  # fmt: skip
 
+    def divided(self, by: int) -> Grid:
+        """The grid whose cells are so many times as small."""
+        rows, cols = self.shape
+        return Grid(self.west_m, self.north_m, self.cell_m / by, (rows * by, cols * by))
+
     def pixels(self, xy_m: F64) -> F64:
         """(N, 2) column and row, real-valued with whole numbers at cell centres, of (N, 2) m."""
         xy = np.asarray(xy_m, np.float64)

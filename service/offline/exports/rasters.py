@@ -18,9 +18,9 @@ import numpy as np
 from recon.mapping.voxel_map import ground_sample_m
 from recon.parallel import run_parallel, threads
 from recon.surface.orthophoto import STEPS, Terrain, orthophoto
-from recon.surface.raster import Grid, Raster, round_cell
+from recon.surface.raster import LARGEST_CELLS, Grid, Raster, round_cell
 from recon.surface.texture_views import TextureView
-from recon.types import Array
+from recon.types import U8, Array, Bool
 from service.errors import InputError
 from service.georeference import map_crs
 from service.offline.exports.images import recording_for, shared_images
@@ -53,6 +53,10 @@ SOME_MAP = "EPSG:32631"
 
 OBJECT_M = 1.0
 """Above the bare ground; seams of the orthophoto run around what is higher."""
+
+MEAN_OF = 4
+"""A cell shows the mean of so many places along each side at most: one place of a large cell would
+make dots of edges and lines."""
 
 GROUND_MARGIN_M = 40.0
 """Around a tile: the widest object that the bare ground is bridged below."""
@@ -128,11 +132,28 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     ]
     cell_m = options.cell_m or round_cell(float(np.nanmedian(sample_m)))
     grid = over(terrain.raster.grid.bounds, cell_m)
+    finer = min(
+        cell_m / float(np.nanmedian(sample_m)), np.sqrt(LARGEST_CELLS / np.prod(grid.shape))
+    )
+    fine = grid.divided(min(max(1, int(finer)), MEAN_OF))
     with scan.progress.part("orthophoto of {1} x {0} cells of {2:g} m".format(*grid.shape, cell_m)):
-        rgb, known = orthophoto(terrain, views, grid, scan.progress.counting(STEPS))
+        rgb, known = orthophoto(terrain, views, fine, scan.progress.counting(STEPS))
+    rgb, known = _averaged(rgb, known, grid.shape)
     opacity = np.where(known, 255, 0).astype(np.uint8)
     bands = np.concatenate([rgb.transpose(2, 0, 1), opacity[None]])
     return Layers(grid, bands, ("red", "green", "blue", "opacity")).within(box)
+
+
+def _averaged(rgb: U8, known: Bool, shape: tuple[int, int]) -> tuple[U8, Bool]:
+    """Colours of whole cells (rows, cols), the means of ``known`` finer ones; where most are."""
+    if rgb.shape[:2] == shape:
+        return rgb, known
+    total, share = (
+        cv2.resize(one, shape[::-1], interpolation=cv2.INTER_AREA)
+        for one in (rgb, known.astype(np.float32))
+    )
+    mean = np.clip(np.rint(total / np.maximum(share, 1e-6)[..., None]), 0, 255)
+    return mean.astype(np.uint8), share > 0.5
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:

@@ -288,6 +288,22 @@ def test_ortho_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
     assert np.median(enu[:, 1]) == pytest.approx(2.0, abs=0.3)
 
 
+def test_a_large_cell_of_the_orthophoto_shows_its_mean(scan_dir: Path) -> None:
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
+    with rasterio.open(written(scan_dir, "ortho")) as image:
+        fine, cell_m, west, north = image.read(), *(image.transform[k] for k in (0, 2, 5))
+    with rasterio.open(written(scan_dir, "ortho", ExportOptions(cell_m=4 * cell_m))) as image:
+        coarse = image.read()
+        left, top = (west - image.transform.c) / cell_m, (image.transform.f - north) / cell_m
+    rows, cols = (4 * side for side in coarse.shape[1:])
+    spread = np.zeros((4, rows, cols))
+    spread[:, round(top) :, round(left) :][:, : fine.shape[1], : fine.shape[2]] = fine
+    blocks = spread.reshape(4, rows // 4, 4, cols // 4, 4)
+    whole = (blocks[3] == 255).all(axis=(1, 3))
+    off = np.abs(blocks[:3].mean(axis=(2, 4)) - coarse[:3])[:, whole]
+    assert whole.sum() > 100 and np.quantile(off, 0.99) < 4.0
+
+
 @pytest.mark.parametrize("side_m", [3.0, 9.0])
 def test_ortho_closes_holes(tmp_path: Path, house: HouseFlight, side_m: float) -> None:
     """Level ground without depth, which the images show, gets its colours."""
