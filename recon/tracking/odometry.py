@@ -91,7 +91,6 @@ class Odometry:
         self.segment = -1
         self._lost = 0
         self._missed_frame: Frame | None = None  # the last still, where it is lost
-        self._late: Frame | None = None  # it, once the next still has placed it
         self._model = ConstantVelocity(0, np.eye(4), UNKNOWN)  # of the newest segment
         self.exposure = ExposureWatch()
         self._row_track = RowTrack(lens or camera, seeks_readout)
@@ -124,28 +123,21 @@ class Odometry:
     def track(self, frame: Frame) -> list[Frame]:
         """The new frame with its pose, or why there is none; before it the last still, lost until
         now, where both together start a segment."""
-        found = self._track(frame)
-        late, self._late = self._late, None
-        return [found] if late is None else [late, found]
-
-    def _track(self, frame: Frame) -> Frame:
-        """The new frame. Of a blurred one a later frame makes a better keyframe, if it comes
-        soon."""
         time_ns, prior = frame.time_ns, frame.prior
         expected = self._expected(time_ns, prior)
         new = replace(frame, row_motion=self._row_track.expect(time_ns, prior, expected))
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
-            return self._start(new)
+            return [self._start(new)]
         if not self._is_metric:
             return self._second_view(new)
         found = self._localiser.locate(
             new, self.keyframes, self._model, self._low_frame_rate, lost=self._lost > 0
         )
         if not isinstance(found, str):
-            return self._accept(new, found)
+            return [self._accept(new, found)]
         pair = self._localiser.by_two_views(new, self.keyframes) if self._low_frame_rate else None
-        return self._missed(new, found) if pair is None else self._accept_two_views(new, pair)
+        return self._missed(new, found) if pair is None else [self._accept_two_views(new, pair)]
 
     def _expected(self, time_ns: int, prior: PosePrior) -> F64:
         """(4, 4) T_camera_odom of a new frame, as far as it can be foreseen."""
@@ -175,22 +167,21 @@ class Odometry:
     def _unplaced(self, new: Frame, state: Tracking, reason: str, tracks: int = 0) -> Frame:
         return replace(new, state=state, segment=self.segment, tracks=tracks, reason=reason)
 
-    def _missed(self, new: Frame, reason: str) -> Frame:
+    def _missed(self, new: Frame, reason: str) -> list[Frame]:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
         if self._low_frame_rate and self._missed_frame is not None and self._lost >= 2:
             first, self._missed_frame = self._missed_frame, None
             started = self._start(first)
             if started.state is Tracking.STARTED:
-                second = self._second_view(new)
-                if second.state is Tracking.KEYFRAME:
-                    self._late = replace(started, state=Tracking.KEYFRAME, reason=first.reason)
-                return second
+                (second,) = self._second_view(new)
+                late = replace(started, state=Tracking.KEYFRAME, reason=first.reason)
+                return [late, second] if second.state is Tracking.KEYFRAME else [second]
         elif not self._low_frame_rate and self._lost >= LOST_AFTER:
             self._start(new)
         lost = self._unplaced(new, Tracking.LOST, reason)
         self._missed_frame = lost if self._low_frame_rate else None
-        return lost
+        return [lost]
 
     def _start(self, new: Frame) -> Frame:
         uv = self._corners(new)
@@ -227,7 +218,7 @@ class Odometry:
 
     # ---- the second view --------------------------------------------------------------
 
-    def _second_view(self, new: Frame) -> Frame:
+    def _second_view(self, new: Frame) -> list[Frame]:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
@@ -243,19 +234,13 @@ class Odometry:
         if moved >= least or (R_b_a is None and self._is_no_turn(first.uv[ok], uv[ok])):
             inverse_depth = 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0
             view = self._localiser.motion_since(
-                first,
-                new,
-                uv,
-                ok,
-                inverse_depth,
-                R_b_a,
-                FIRST_TURN_RAD,
+                first, new, uv, ok, inverse_depth, R_b_a, FIRST_TURN_RAD,
                 may_be_wrong=self._low_frame_rate,
-            )
+            )  # fmt: skip
         if moved < least and (view is None or view.parallax_rad < least):
             if self._row_track.is_known and len(self._early) < EARLY:
                 self._early.append((new.row_motion, uv, ok))
-            return self._unplaced(new, Tracking.WAITING, "too little motion", int(ok.sum()))
+            return [self._unplaced(new, Tracking.WAITING, "too little motion", int(ok.sum()))]
         if view is None or view.parallax_rad < MIN_BASE_TO_HEIGHT:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
@@ -265,7 +250,7 @@ class Odometry:
         first.landmark[matched[view.inliers]] = first.landmarks.add(points)
         self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
-        return self._accept_two_views(new, (first, second @ first.T_camera_odom, uv, ok))
+        return [self._accept_two_views(new, (first, second @ first.T_camera_odom, uv, ok))]
 
     def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
         """True where no turn of the camera explains matched pixels (N, 2). A camera that circles a
@@ -288,7 +273,8 @@ class Odometry:
     # ---- keyframes ---------------------------------------------------------------------
 
     def _accept(self, new: Frame, found: Located) -> Frame:
-        """Keep the pose; make the frame a keyframe when it has moved enough."""
+        """Keep the pose; make the frame a keyframe when it has moved enough. A blurred one waits a
+        while longer, as a sharp one is better."""
         key = found.key
         T_camera_odom = found.pose.T_camera_points
         moved = T_camera_odom @ key.T_odom_camera
