@@ -80,7 +80,7 @@ class KeyframeMap:
         )
         if depth is not None and self._loops is not None:
             with self._timing("loops"):
-                self._loops.look(view.seq, view.segment, view.image.gray, view.image.K, depth)
+                self._loops.add(view.seq, view.segment, view.image.gray, view.image.K, depth)
         return self.trajectory.pose(view.seq)
 
     def publish(self, seq: int, pose: Pose) -> bool:

@@ -101,8 +101,8 @@ class LoopSearch:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def look(self, seq: int, segment: int, gray: U8, K: F64, depth: DepthMap) -> None:
-        """Search for loops that end in this keyframe, and remember it.
+    def add(self, seq: int, segment: int, gray: U8, K: F64, depth: DepthMap) -> None:
+        """Remember a keyframe, and search for loops that end in it.
 
         Args:
             gray: (H, W) image without distortion, ``K`` (3, 3) px of it.

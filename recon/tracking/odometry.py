@@ -362,7 +362,7 @@ class Odometry:
             adjust_window(self.keyframes, self.K)
             self._rows_awaited = None
             search = self.readout if self._row_track.is_rolling else None
-            if search is not None and search.look(self.keyframes):
+            if search is not None and search.update(self.keyframes):
                 adjust_window(self.keyframes, self.K)
             if search is not None and search.is_none:
                 self._row_track.stop()

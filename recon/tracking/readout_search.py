@@ -73,7 +73,7 @@ class ReadoutSearch:
         off_s = self.readout_s - self._clock.readout_s
         return min(float(np.hypot(self.sigma_s, off_s)), USUAL_S)
 
-    def look(self, keyframes: list[Frame]) -> bool:
+    def update(self, keyframes: list[Frame]) -> bool:
         """Search once the newest of the ``keyframes``, all settled, ends a further window. True
         where this changes the readout in use."""
         before_s = self._clock.readout_s

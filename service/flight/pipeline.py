@@ -114,7 +114,7 @@ class Pipeline:
     def _watched(self, place: Callable[[], Reconstructed]) -> Reconstructed:
         """Place a view, and examine the graph now and then."""
         update = place()
-        self._doubts.extend(self.watch.look())
+        self._doubts.extend(self.watch.new_findings())
         return update
 
     def new_doubts(self) -> list[str]:

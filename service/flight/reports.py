@@ -40,7 +40,7 @@ class GraphWatch:
         self._seen = 0
         self._reported: set[str] = set()
 
-    def look(self) -> list[str]:
+    def new_findings(self) -> list[str]:
         """New findings, once for each kind; looks when the keyframes have grown enough."""
         if self._graph.entered < max(LEAST, LOOK_GROWTH * self._seen):
             return []
@@ -189,7 +189,7 @@ class TrackingWatch:
         self._frames, self._is_reported = 0, False
         self._reasons: Counter[str] = Counter()
 
-    def look(self, frame: Frame, time_ns: int) -> None:
+    def add(self, frame: Frame, time_ns: int) -> None:
         """Take the result of a frame; times never decrease. A camera that stands still is not
         lost."""
         if frame.state in FOUND:

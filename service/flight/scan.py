@@ -193,7 +193,7 @@ class Scan:
         posed = events[-1]
         assert isinstance(posed, FramePosed)
         self.check.add(time_ns, posed.frame)
-        self.tracking.look(posed.frame, time_ns)
+        self.tracking.add(posed.frame, time_ns)
         self.report_blur()
         for doubt in self.pipeline.new_doubts():
             inputs.warn(doubt)

@@ -379,7 +379,7 @@ def test_a_known_readout_gives_way_to_sharp_images_alone(sharpness: float, expec
 
     search = ReadoutSearch(clock, PLAIN.K, cost)
     for first in range(0, 40, 10):
-        search.look([keyframe_at(first + k, np.eye(4), is_measured=True) for k in range(5)])
+        search.update([keyframe_at(first + k, np.eye(4), is_measured=True) for k in range(5)])
     assert clock.readout_s == pytest.approx(expected)
 
 

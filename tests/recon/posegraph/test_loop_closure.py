@@ -311,7 +311,7 @@ def search_along(poses: list[F64], chain: list[F64], segment: list[int]) -> Loop
     for i, (T, odom) in enumerate(zip(poses, chain, strict=True)):
         trajectory.add(i, segment[i], odom, PosePrior(), None, i * 10**9, covariance)
         seen = view(T, i)
-        search.look(i, segment[i], seen.gray, K, seen.depth)
+        search.add(i, segment[i], seen.gray, K, seen.depth)
     return search
 
 
@@ -378,7 +378,7 @@ def test_after_a_loop_the_search_waits_until_the_view_has_moved_on() -> None:
     for i, share in enumerate((0.0, 0.1, 0.2, 0.3, 0.31, 0.32, 0.33, 0.34)):
         T = camera(share * diagonal_m, 0.0, 40.0, 0.0)
         trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
-        search.look(i, 0, seen.gray, K, seen.depth)
+        search.add(i, 0, seen.gray, K, seen.depth)
     assert searched == [0, 3, 7]
 
 
@@ -390,6 +390,6 @@ def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPa
     for i in range(20):
         T = camera(300.0 * i, 0.0, 40.0, 0.0)
         trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
-        search.look(i, 0, rng.integers(0, 255, seen.gray.shape, np.uint8), K, seen.depth)
+        search.add(i, 0, rng.integers(0, 255, seen.gray.shape, np.uint8), K, seen.depth)
         assert len(search) <= 6
     assert not verified.called

@@ -32,7 +32,7 @@ def warnings_of(priors: list[PosePrior]) -> tuple[list[str], GraphWatch]:
     watch = GraphWatch(graph)
     for i, (T, p) in enumerate(zip(track(len(priors)), priors, strict=True)):
         graph.add_keyframe(i, i * 10**9, 0, T, COVARIANCE, p, (60.0, 0.0))
-        heard += watch.look()
+        heard += watch.new_findings()
     return heard, watch
 
 
@@ -100,5 +100,5 @@ def test_a_track_that_the_fixes_contradict_is_reported() -> None:
         swing = np.array([0.0, 3.0 * np.sin(0.5 * i), 1.5 * np.cos(0.5 * i)])
         seen = se3.compose(T[:3, :3], T[:3, 3] + swing)
         graph.add_keyframe(i, i * 10**9, 0, seen, COVARIANCE, fix, (60.0, 0.0))
-        watch_said += watch.look()
+        watch_said += watch.new_findings()
     assert sum("track and GNSS differ" in text for text in watch_said) == 1

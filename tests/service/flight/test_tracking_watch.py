@@ -15,7 +15,7 @@ def flown(*states: str) -> list[str]:
     for k, state in enumerate(states):
         reason = {"lost": "too little texture", "waiting": "too little motion"}.get(state, "")
         frame = Frame(NO_IMAGE, 0, k, state=Tracking(state), reason=reason)
-        watch.look(frame, 100 * S + k * S // 2)
+        watch.add(frame, 100 * S + k * S // 2)
     return reported
 
 
