@@ -250,6 +250,19 @@ class VehicleHistory:
             return self._gimbals.setdefault((sample.rank, sample.component), TimeSeries())
         return self._tracks[type(sample)]
 
+    def at_rate(self, rate: float, zero_ns: int) -> VehicleHistory:
+        """A copy by a clock that shows the same at ``zero_ns`` and gains ``rate`` seconds in each
+        of this one's."""
+        out = VehicleHistory(self.config)
+        out.vertical_datum = self.vertical_datum
+        out.is_pressure_altitude = self.is_pressure_altitude
+        with self._lock:
+            tracks = [*self._tracks.values(), *self._gimbals.values()]
+            samples = [one for track in tracks for one in track.items()]
+        for time_ns, sample in samples:
+            out.add(sample, time_ns + round(rate * (time_ns - zero_ns)))
+        return out
+
     def state_at(self, time_ns: int, waits: bool = True) -> VehicleState | None:
         """The state interpolated at ``time_ns``, or None when no part of it is known.
 

@@ -21,6 +21,7 @@ from mavlink.telemetry.quaternion import Quaternion, conjugate, multiply, normal
 MIN_WINDOWS, MIN_SPAN_S = 12, 10.0  # non-overlapping, and their time together
 FITTED = 6  # windows that the rotation, the scatter and the time are worth
 MIN_CORRELATION = 0.7
+SURE = 0.9  # correlation at which images surely turn with the log
 WINDOW_S = 0.2  # shorter rotations are mostly noise; longer ones hide the latency
 FLOOR_MS = 2.0  # accuracy of exposure times and telemetry stamps
 SETTLED_MS = 5.0  # maximum sigma of an estimate that may be applied
@@ -115,6 +116,22 @@ class LatencyWatch:
             return None
         return self._about(Attitudes(attitudes), 0.0)
 
+    def rate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> tuple[float, float] | None:
+        """How fast the latency grows, seconds in a second, and its sigma: by the latencies of the
+        earlier and of the later half of the frames. None where one of them is not sure."""
+        if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
+            return None
+        track = Attitudes(attitudes)
+        seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
+        is_late: Bool = seen.start_s > 0.5 * (seen.start_s[:1] + seen.end_s[-1:])
+        early, late = (self._of(seen.only(mask), track, 0.0) for mask in (~is_late, is_late))
+        if early is None or late is None or min(early.correlation, late.correlation) < SURE:
+            return None
+        apart_s = float(seen.start_s[is_late].mean() - seen.start_s[~is_late].mean())
+        grown_ms = late.latency_ms - early.latency_ms
+        sigma_ms = float(np.hypot(early.sigma_ms, late.sigma_ms))
+        return 1e-3 * grown_ms / apart_s, 1e-3 * sigma_ms / apart_s
+
     def anywhere(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
         """The latency by attitudes of a whole log; of a recording whose clock is minutes off."""
         if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
@@ -136,6 +153,10 @@ class LatencyWatch:
     def _about(self, track: Attitudes, about_s: float) -> LatencyEstimate | None:
         """The latency within ``REACH_S`` of ``about_s``."""
         seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
+        return self._of(seen, track, about_s)
+
+    @staticmethod
+    def _of(seen: _Turns, track: Attitudes, about_s: float) -> LatencyEstimate | None:
         steps = round(REACH_S / COARSE_S)
         lags: F64 = about_s + COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
         coarse_s = _best_lag(seen.apart(), track, lags)

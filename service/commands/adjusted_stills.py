@@ -34,8 +34,9 @@ from service.config import change
 from service.errors import InputError
 from service.flight.pipeline import mapper_config
 from service.flight.scan import ScanInputs, check_new
-from service.flight.telemetry_check import TelemetryCheck, differs
+from service.flight.telemetry_check import TelemetryCheck
 from service.offline.refine.own_camera import sightings
+from service.scans.trust import is_another_latency
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +76,8 @@ def adjusted_stills(
     check_new(inputs.folder)
     progress("adjusting all stills together")
     stills, latency = _tracked(inputs, source, history)
-    if latency is not None and not is_latency_given and differs(latency, 0.0):
+    is_late = latency is not None and is_another_latency(latency.latency_ms, latency.sigma_ms, 0.0)
+    if latency is not None and is_late and not is_latency_given:
         note = (
             f"the images show that the stills' times are late by {latency.latency_ms:.0f} ms "
             f"(sigma {latency.sigma_ms:.0f} ms): corrected"

@@ -196,7 +196,7 @@ def with_stated_readout(
 class Correction:
     """What the images of a scan correct, for a scan that is right from its start."""
 
-    of: str  # "readout", "clock"
+    of: str  # "readout", "clock", "clock's rate"
     changed: dict[str, Any]  # of its inputs
 
 
@@ -207,6 +207,9 @@ def correction_of(
     off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
     if off_ms is not None:
         return Correction("clock", at_another_time(scan.inputs, off_ms))
+    rate = scan.check.clock_rate(has_ended) if "clock's rate" in unsure else None
+    if rate is not None:
+        return Correction("clock's rate", at_another_rate(scan.inputs, rate))
     shutter = scan.found_shutter() if "readout" in unsure else None
     if shutter is None:
         return None
@@ -304,6 +307,19 @@ def at_another_time(inputs: ScanInputs, off_ms: float) -> dict[str, Any]:
         "unix_offset_ns": offset_ns and offset_ns + off_ns,
         "notes": (*inputs.notes, note),
     }
+
+
+def at_another_rate(inputs: ScanInputs, rate: float) -> dict[str, Any]:
+    """Inputs of the scan of a video whose clock gains ``rate`` seconds in each of the log's: the
+    log's times become those of the video, from its beginning on."""
+    assert inputs.history is not None
+    word = "fast" if rate > 0 else "slow"
+    note = (
+        f"the video's clock runs {100.0 * abs(rate):.2f} % too {word}, as its images turn with the "
+        "log: applied"
+    )
+    history = inputs.history.at_rate(rate, inputs.epoch_ns)
+    return {"history": history, "notes": (*inputs.notes, note)}
 
 
 def load_log(path: Path, config: Config) -> TelemetryLog:

@@ -177,7 +177,8 @@ def _lens(
 def _unsure(log: TelemetryLog | None, is_clock_given: bool) -> set[str]:
     """What the images of a recording may correct: then its scan begins again."""
     is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
-    return {"readout"} if is_of_camera or is_clock_given else {"readout", "clock"}
+    is_sure = is_of_camera or is_clock_given
+    return {"readout"} if is_sure else {"readout", "clock", "clock's rate"}
 
 
 def _corrected(
@@ -192,11 +193,12 @@ def _corrected(
     corrected = inputs
     while isinstance(found, Correction):
         progress(f"beginning again with the {found.of} that was found")
-        # A readout that was sought with another clock is sought once more.
-        unsure = {"readout"} if found.of == "clock" else unsure - {"readout"}
-        base = inputs if found.of == "clock" else corrected
+        unsure = unsure - {found.of}
+        if found.of != "readout":  # one that was sought with another clock is sought once more
+            unsure |= {"readout"}
+            corrected = inputs = replace(inputs, **found.changed)
         with closing(open_camera(video)) as again:
-            corrected = replace(base, source=again, **found.changed)
+            corrected = replace(corrected, source=again, **found.changed)
             found = fly(corrected, stop, progress, unsure)
     return found
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from mavlink.telemetry.gimbal import FrameVerdict, frame_by_images
 from mavlink.telemetry.history import VehicleHistory
-from mavlink.telemetry.latency import LatencyEstimate, LatencyWatch
+from mavlink.telemetry.latency import KEPT, SURE, LatencyEstimate, LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import GimbalFrame
 from recon.frames import R_GIMBAL_CAMERA
@@ -21,6 +21,7 @@ from recon.se3 import quaternion_from_rotation
 from recon.tracking.frame import Frame, Tracking
 from recon.types import F64
 from service.config import CameraConfig
+from service.scans.trust import is_another_latency
 
 log = logging.getLogger(__name__)
 
@@ -29,16 +30,13 @@ REACH_NS = 60_000_000_000  # how far back telemetry is compared with frames, at 
 AHEAD_NS = 2_000_000_000  # how far ahead of the newest frame; a recording's log goes on
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
 UNSEEN_S = 0.05  # sigma of a latency that the images have not shown yet
-WORTH_TELLING_MS, OFF_SIGMAS = 10.0, 5.0  # a latency that differs by less is not reported
-SURE_OF_CLOCK, MIN_CLOCK_OFF_MS = 0.9, 100.0  # of a recording: correlation; less is a latency
+MIN_CLOCK_OFF_MS = 100.0  # of a recording: less is a latency
+MIN_RATE, RATE_SIGMAS = 3e-4, 6.0
+"""Of a recording: by how much a clock gains that is surely another one. Crystals differ by a tenth
+of it, 29.97 from 30 images a second by three times as much."""
+
 CLOCK_OFF_SIGMAS = 10.0
 STILLS = 60  # images that are compared, where they come more slowly than REACH_NS holds
-
-
-def differs(found: LatencyEstimate, applied_ms: float) -> bool:
-    """True where the latency found is surely another one than that applied."""
-    off_ms = abs(found.latency_ms - applied_ms)
-    return off_ms > max(WORTH_TELLING_MS, OFF_SIGMAS * found.sigma_ms)
 
 
 class TelemetryCheck:
@@ -63,6 +61,7 @@ class TelemetryCheck:
         self._camera = camera
         self.applied_ms = self._wanted_ms()
         self._turns = LatencyWatch()
+        self._rated_ns: int | None = None  # the look whose frames gave no rate
         self._last: tuple[int, int, F64] | None = None  # stamp, segment, R_odom_camera
         self._seen_ns: int | None = None
         self._next_ns: int | None = None
@@ -124,7 +123,7 @@ class TelemetryCheck:
     @property
     def is_clock_sure(self) -> bool:
         """Whether the images turn with the log."""
-        return self.latency is not None and self.latency.correlation >= SURE_OF_CLOCK
+        return self.latency is not None and self.latency.correlation >= SURE
 
     def clock_off_ms(self, has_ended: bool = False) -> float | None:
         """By how much a recording's stamps are surely late, beyond a camera's latency; or None.
@@ -141,8 +140,22 @@ class TelemetryCheck:
             self._in_log = self._turns.anywhere(self._attitudes(self._history)())
         return None if self._in_log is None else self._off_ms(self._in_log)
 
+    def clock_rate(self, has_ended: bool = False) -> float | None:
+        """How many seconds a recording's clock surely gains in each of the log's; or None."""
+        is_due = has_ended or self._rated_ns != self._next_ns
+        if self._history is None or self._seen_ns is None or not is_due:
+            return None
+        self._rated_ns, first_ns = self._next_ns, self._turns.since_ns(KEPT)
+        if first_ns is None:
+            return None
+        near = self._attitudes(self._history)(first_ns - REACH_NS, self._seen_ns + AHEAD_NS)
+        found = self._turns.rate(near)
+        if found is None or abs(found[0]) < max(MIN_RATE, RATE_SIGMAS * found[1]):
+            return None
+        return found[0]
+
     def _off_ms(self, found: LatencyEstimate) -> float | None:
-        if found.correlation < SURE_OF_CLOCK:
+        if found.correlation < SURE:
             return None
         off_ms = found.latency_ms - self._camera.latency_ms
         is_off = abs(off_ms) > max(MIN_CLOCK_OFF_MS, CLOCK_OFF_SIGMAS * found.sigma_ms)
@@ -175,7 +188,7 @@ class TelemetryCheck:
         text = f"Camera latency {found.latency_ms:.0f} ms by the images"
         if self._camera.latency == "auto" and found.is_settled:
             self._once("latency", f"{text}: applied")
-        elif differs(found, self.applied_ms):
+        elif is_another_latency(found.latency_ms, found.sigma_ms, self.applied_ms):
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
 
     def _judge_frame(self, history: VehicleHistory) -> None:

@@ -52,6 +52,9 @@ OVER_CLAIM = 2.0
 """Positions that scatter so many times as far as they claim are reported, and vision's scale that
 changes as many times as far as usual."""
 
+MAX_LATENCY_MS, LATENCY_SIGMAS = 10.0, 5.0
+"""A camera's latency by the images that differs from the one applied by both is another one."""
+
 SCALE_KINDS = ("scale", "loop scale")
 """Residuals of the pose graph that show it."""
 
@@ -174,6 +177,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         limits.append(f"positions scatter {over:.1f} times as far as they claim: sigma follows it")
     if ratio:
         limits.append(scales_differ(ratio))
+    if (late := _latency_off(run)) is not None:
+        limits.append(f"{late}: the map is shifted along the flight; set camera.latency_ms")
     wander = _scale_wander(run)
     if wander > OVER_CLAIM:
         limits.append(
@@ -181,6 +186,22 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
             "in the camera, or the lens another one?"
         )
     return _said(Trust.GEOREFERENCED, limits)
+
+
+def _latency_off(run: Mapping[str, Any]) -> str | None:
+    """A sentence on a camera's latency that is surely another one than that applied, or None."""
+    latency = _part(run, "camera_latency")
+    found, sigma = _number(latency, "estimate_ms"), _number(latency, "sigma_ms")
+    applied = _number(latency, "applied_ms")
+    if found is None or sigma is None or applied is None:
+        return None
+    if not is_another_latency(found, sigma, applied):
+        return None
+    return f"the images show a camera latency of {found:.0f} ms, {applied:.0f} ms are applied"
+
+
+def is_another_latency(found_ms: float, sigma_ms: float, applied_ms: float) -> bool:
+    return abs(found_ms - applied_ms) > max(MAX_LATENCY_MS, LATENCY_SIGMAS * sigma_ms)
 
 
 def _uncertain(sigma_focal: float) -> str:

@@ -29,9 +29,10 @@ def attitude(t: float, strength: float = 1.0) -> Quaternion:
 
 
 def watch_flight(
-    latency_s: float, noise_rad: float, strength: float, hz: float, seconds: float = 40.0
-) -> LatencyWatch:
-    """The view of a camera with a latency; its mount does not matter."""
+    latency_s: float, noise_rad: float, strength: float, hz: float, seconds: float = 40.0,
+    rate: float = 0.0,
+) -> LatencyWatch:  # fmt: skip
+    """The view of a camera with a latency, and a clock that gains ``rate``; any mount will do."""
     rng = np.random.default_rng(7)
     watch = LatencyWatch()
     mount = Rotation.from_euler("ZYX", [0.4, -1.3, 0.1])
@@ -41,7 +42,8 @@ def watch_flight(
         first, second = (of_scipy_head(attitude(x, strength), mount) for x in (t, t + step))
         seen = first.inv() * second * Rotation.from_rotvec(rng.normal(0.0, noise_rad, 3))
         x, y, z, w = map(float, seen.as_quat())
-        watch.add(round((t + latency_s) * S), round((t + step + latency_s) * S), (w, x, y, z))
+        stamps = (round((at + latency_s + rate * at) * S) for at in (t, t + step))
+        watch.add(*stamps, (w, x, y, z))
     return watch
 
 
@@ -87,6 +89,19 @@ def test_the_long_turns_are_those_of_two_minutes_at_any_rate(hz: int) -> None:
     for start_ns, end_ns, turn in watch.long_turns:
         assert end_ns - start_ns == S
         assert turn == pytest.approx(quaternion.from_rpy(0.0, 0.0, 0.1), abs=1e-12)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.003, -0.01])
+def test_a_clock_that_gains_is_found(rate: float) -> None:
+    found = watch_flight(0.05, 5e-4, 1.0, 15.0, rate=rate).rate(attitudes(20.0, noise_rad=1e-3))
+    assert found is not None and found[1] < 1e-3
+    assert abs(found[0] - rate) < 4.0 * found[1]
+
+
+def test_a_rate_needs_turns_in_both_halves() -> None:
+    assert LatencyWatch().rate(attitudes(20.0)) is None
+    assert watch_flight(0.0, 5e-4, 1.0, 15.0, seconds=15.0).rate(attitudes(20.0)) is None
+    assert watch_flight(0.0, 5e-4, 0.0, 15.0).rate(attitudes(20.0, 0.0, 1e-3)) is None
 
 
 def test_a_recording_is_found_anywhere_in_its_log() -> None:

@@ -68,8 +68,10 @@ def fly(
     noise_rad: float = 5e-4,
     gap: bool = False,
     hz: float = 15.0,
+    rate: float = 0.0,
 ) -> list[int]:
-    """Forty seconds of frames whose stamps are 70 ms late; the times of exposure."""
+    """Forty seconds of frames whose stamps are 70 ms late, and ever later by ``rate``; the times of
+    exposure."""
     rng = np.random.default_rng(2)
     mount = Rotation.from_euler("Y", -math.pi / 3)
     exposed = []
@@ -78,7 +80,7 @@ def fly(
         noise = Rotation.from_rotvec(rng.normal(0.0, noise_rad, 3))
         T = np.eye(4)
         T[:3, :3] = (body(t, strength) * mount * noise).as_matrix() @ R_GIMBAL_CAMERA
-        stamp = round((t + LATE_S) * S)
+        stamp = round((t + LATE_S + rate * t) * S)
         lost = gap and 200 <= k < 205
         exposed.append(check.exposed_ns(stamp))
         segment = int(gap and k >= 205)
@@ -125,6 +127,20 @@ def test_stamps_that_are_off_by_more_than_a_latency_show_a_clock(
     fly(check, strength)
     found = check.clock_off_ms()
     assert found == (None if off_ms is None else pytest.approx(off_ms, abs=10.0))
+
+
+@pytest.mark.slow
+def test_a_recording_whose_clock_gains_shows_its_rate() -> None:
+    history, rate = history_of("none", 1.0), 0.003
+    check = TelemetryCheck(CameraConfig(), history)
+    fly(check, rate=rate)
+    found = check.clock_rate()
+    assert found == pytest.approx(rate, abs=3e-4)
+    assert check.clock_rate() is None  # until there are more frames
+    again = TelemetryCheck(CameraConfig(), history.at_rate(found, S))
+    fly(again, rate=rate)
+    assert again.latency is not None and again.clock_rate(has_ended=True) is None
+    assert again.latency.latency_ms == pytest.approx(1e3 * (LATE_S + rate), abs=5.0)
 
 
 def test_a_clock_that_the_whole_log_does_not_confirm_stays() -> None:

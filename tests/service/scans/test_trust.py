@@ -111,6 +111,16 @@ def test_positions_that_scatter_further_than_claimed_are_named() -> None:
         assert found == {"level": "georeferenced", "reasons": reasons}
 
 
+@pytest.mark.parametrize(("found_ms", "sigma_ms"), [(45.0, 3.0), (-30.0, 2.0)])
+def test_a_latency_that_is_not_applied_is_named(found_ms: float, sigma_ms: float) -> None:
+    latency = {"applied_ms": 0.0, "estimate_ms": found_ms, "sigma_ms": sigma_ms}
+    found = trust_of(SURE | {"camera_latency": latency}, "gnss")
+    assert found["level"] == "georeferenced"
+    assert f"a camera latency of {found_ms:.0f} ms, 0 ms are applied" in found["reasons"][0]
+    for other in ({"applied_ms": found_ms - 8.0}, {"sigma_ms": 10.0}, {"estimate_ms": None}):
+        assert not trust_of(SURE | {"camera_latency": latency | other}, "gnss")["reasons"]
+
+
 def test_a_scale_of_vision_that_wanders_is_named_and_less_certain() -> None:
     """As where the camera stabilises its images: their centre moves against the lens."""
     still, moved = ({"residuals": {"loop scale": {"count": 9, "rms": r}}} for r in (0.8, 3.0))
