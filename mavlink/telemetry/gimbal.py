@@ -165,6 +165,34 @@ def frame_by_images(
     return FrameVerdict(best, bool(rivals) and refuted == tuple(rivals), refuted)
 
 
+LEAST_TURNS = 8
+STEADY_SHARE, SWAYS_RAD, STRAIGHT_ON_RAD = 0.5, math.radians(1.5), math.radians(4.0)
+"""A camera tilts by less than this share of what its vehicle tilts by, which tilts by this rms, in
+turns in which the vehicle keeps its heading so well, which the camera may follow."""
+
+
+def is_stabilised(
+    turns: Sequence[Turn], body_at: Callable[[int], Quaternion | None], latency_ms: float = 0.0
+) -> bool:
+    """True where the images surely hold still while the vehicle tilts: its attitude is not theirs.
+
+    Sums are compared, not turn by turn, as the latency may be wrong.
+    """
+    shift = round(latency_ms * 1e6)
+    tilted = seen = count = 0.0
+    for first_ns, second_ns, turn in turns:
+        a, b = body_at(first_ns - shift), body_at(second_ns - shift)
+        if a is None or b is None:
+            continue
+        w, x, y, z = multiply(b, conjugate(a))  # in NED
+        if 2.0 * abs(z) < STRAIGHT_ON_RAD * abs(w):
+            tilted += 4.0 * (x * x + y * y)
+            seen += angle_between(turn, (1.0, 0.0, 0.0, 0.0)) ** 2 - 4.0 * z * z
+            count += 1.0
+    is_known = count >= LEAST_TURNS and tilted > SWAYS_RAD**2 * count
+    return is_known and seen < STEADY_SHARE**2 * tilted
+
+
 def _disagreement(heads: Sequence[Ends], steps: Sequence[Quaternion]) -> float:
     """Root mean square angle in rad between the steps of the heads and those seen."""
     squares = [

@@ -171,6 +171,12 @@ class VehicleHistory:
             out += [(at, _body(replace(gap, time_ns=at))) for at in times]
         return out
 
+    def body_at(self, time_ns: int) -> Quaternion | None:
+        """``q_ned_body`` at a time, if known."""
+        with self._lock:
+            at = self._attitude.around(time_ns)
+        return None if at is None else _body(at)
+
     def claimed_at(self, time_ns: int) -> tuple[Quaternion, Quaternion] | None:
         """(the gimbal's quaternion as sent, ``q_ned_body``) at a time, if known."""
         with self._lock:

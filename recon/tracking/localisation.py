@@ -52,6 +52,8 @@ MAX_TILT_ERROR_RAD = 0.35
 """Vision against attitude, 20 degrees: since the keyframe before no gimbal or compass in order errs
 by more, so it is a false solution."""
 
+DISAGREES = "vision and attitude disagree"  # why a frame has no pose
+
 LOOSE_PX = 6.0  # gate of a second try: a rolling shutter bends images that much
 LOW_RATE_GAP_S = 0.7  # frames further apart are stills: no motion model holds
 RECALLED = 4  # newest keyframes compared by features: at 75 % overlap no more share the ground
@@ -101,6 +103,7 @@ class Localiser:
         motion: ConstantVelocity,
         low_frame_rate: bool,
         lost: bool,
+        heeds_turn: bool = True,
     ) -> Located | str:
         """The frame against a recent keyframe, averaged with the one before; or why not.
 
@@ -108,6 +111,7 @@ class Localiser:
             motion: where the camera was last and how it moved.
             low_frame_rate: too long since the frame before for that motion to hold.
             lost: the frame before has no pose.
+            heeds_turn: a pose that turns otherwise than telemetry is false.
         """
         reason, best = "no match", None
         least = MIN_TRACKS
@@ -118,8 +122,9 @@ class Localiser:
             if isinstance(found, str):
                 reason = found
                 continue
-            if not self._agrees(found.pose.T_camera_points, new.prior, key, by_features):
-                reason = "vision and attitude disagree"
+            T_new = found.pose.T_camera_points
+            if heeds_turn and not self._agrees(T_new, new.prior, key, by_features):
+                reason = DISAGREES
                 continue
             if best is None or found.explained > best.explained:
                 best = found

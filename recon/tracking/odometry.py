@@ -22,6 +22,7 @@ from recon.tracking.focal_watch import FocalWatch
 from recon.tracking.frame import NO_IMAGE, UNKNOWN, Frame, Landmarks, Tracking
 from recon.tracking.keyframe_window import adjust_window, median_depth, triangulate
 from recon.tracking.localisation import (
+    DISAGREES,
     LOOSE_PX,
     LOW_RATE_GAP_S,
     MIN_BASE_TO_HEIGHT,
@@ -89,7 +90,7 @@ class Odometry:
         self._base_to_height = base_to_height
         self.keyframes: list[Frame] = []  # of the current segment
         self.segment = -1
-        self._lost = 0
+        self._lost = self._refused = 0  # frames in a row without a pose; by telemetry's turn
         self._missed_frame: Frame | None = None  # the last still, where it is lost
         self._model = ConstantVelocity(0, np.eye(4), UNKNOWN)  # of the newest segment
         self.exposure = ExposureWatch()
@@ -131,13 +132,25 @@ class Odometry:
             return [self._start(new)]
         if not self._is_metric:
             return self._second_view(new)
-        found = self._localiser.locate(
-            new, self.keyframes, self._model, self._low_frame_rate, lost=self._lost > 0
-        )
+        found = self._located(new)
+        if found == DISAGREES:
+            self._refused += 1
+            found = found if self._heeds_turn else self._located(new)
         if not isinstance(found, str):
             return [self._accept(new, found)]
         pair = self._localiser.by_two_views(new, self.keyframes) if self._low_frame_rate else None
         return self._missed(new, found) if pair is None else [self._accept_two_views(new, pair)]
+
+    def _located(self, new: Frame) -> Located | str:
+        return self._localiser.locate(
+            new, self.keyframes, self._model, self._low_frame_rate,
+            lost=self._lost > 0, heeds_turn=self._heeds_turn,
+        )  # fmt: skip
+
+    @property
+    def _heeds_turn(self) -> bool:
+        """False once telemetry's turn contradicts the images steadily: it is not the camera's."""
+        return self._refused < LOST_AFTER
 
     def _expected(self, time_ns: int, prior: PosePrior) -> F64:
         """(4, 4) T_camera_odom of a new frame, as far as it can be foreseen."""
@@ -188,7 +201,7 @@ class Odometry:
         if len(uv) < 2 * MIN_TRACKS:
             return self._unplaced(new, Tracking.LOST, "too little texture")
         self.segment += 1
-        self._lost = 0
+        self._lost = self._refused = 0
         self._localiser.begin()
         self._row_track.begin()
         self._rows_awaited, self._early = None, []
@@ -223,6 +236,7 @@ class Odometry:
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
         uv, ok = self._localiser.match_first(new, first, R_b_a, self._low_frame_rate)
+        R_b_a = R_b_a if self._heeds_turn else None
         if self._low_frame_rate and ok.sum() < 2 * MIN_TRACKS:
             uv, ok = self._localiser.with_features(new, first, uv, ok) or (uv, ok)
         if ok.sum() < 2 * MIN_TRACKS:
@@ -242,6 +256,7 @@ class Odometry:
                 self._early.append((new.row_motion, uv, ok))
             return [self._unplaced(new, Tracking.WAITING, "too little motion", int(ok.sum()))]
         if view is None or view.parallax_rad < MIN_BASE_TO_HEIGHT:
+            self._refused += R_b_a is not None
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
         ok[matched[~view.inliers]] = False
@@ -285,7 +300,7 @@ class Odometry:
         T_odom_camera = se3.inverse(T_camera_odom)
         px_s = self._px_s(T_odom_camera, depth)
         self._model.update(new.time_ns, T_odom_camera, new.prior)
-        self._lost = 0
+        self._lost, self._refused = 0, 0 if self._heeds_turn else self._refused
         due = self._base_to_height * (OVERDUE if new.is_blurred else 1.0)
         if base < due and found.share > MIN_OVERLAP and turned < MAX_TURN_RAD:
             self._row_track.add(new.row_motion, T_camera_odom)

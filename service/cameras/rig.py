@@ -75,6 +75,7 @@ class Rig:
         self.georeference = "none"
         self.vertical_datum = ""
         self.is_pressure_altitude = False
+        self.is_stabilised = False  # the vehicle's attitude is not the camera's
         self._is_altitude_stated = False
         self._lever_body = np.array(
             [camera.lever_forward_m, camera.lever_right_m, camera.lever_down_m]
@@ -162,7 +163,7 @@ class Rig:
                 R = R_ENU_NED @ se3.rotation_from_quaternion(gimbal) @ R_GIMBAL_CAMERA
                 return R, state.sigma_gimbal_rad or 0.02, state.sigma_yaw_rad or 0.1
             body = state.q_ned_body_wxyz
-            if body is not None and self._camera.mount != "gimbal":
+            if body is not None and self._camera.mount != "gimbal" and not self.is_stabilised:
                 R = R_ENU_NED @ se3.rotation_from_quaternion(body) @ self._R_body_camera
                 return R, state.sigma_attitude_rad or 0.02, state.sigma_yaw_rad or 0.1
         if tag is not None and tag.ypr_deg is not None and self._fusion.attitude:

@@ -31,6 +31,7 @@ from service.cameras.video import metadata, subtitles
 from service.config import change
 from service.errors import InputError
 from service.flight.scan import Scan, ScanInputs, check_new, create_store
+from service.flight.telemetry_check import STABILISED
 from service.stream.validity import MAX_TIME_NS, is_time
 
 if TYPE_CHECKING:  # a flight with a camera model does without calibration
@@ -196,7 +197,7 @@ def with_stated_readout(
 class Correction:
     """What the images of a scan correct, for a scan that is right from its start."""
 
-    of: str  # "readout", "clock", "clock's rate"
+    of: str  # "readout", "clock", "clock's rate", "mount"
     changed: dict[str, Any]  # of its inputs
 
 
@@ -204,12 +205,18 @@ def correction_of(
     scan: Scan, unsure: Collection[str], has_ended: bool = False
 ) -> Correction | None:
     """What the images of the scan show by now, of what is ``unsure``; None before they do."""
+    if has_ended:
+        scan.check.finish()
     off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
     if off_ms is not None:
         return Correction("clock", at_another_time(scan.inputs, off_ms))
     rate = scan.check.clock_rate(has_ended) if "clock's rate" in unsure else None
     if rate is not None:
         return Correction("clock's rate", at_another_rate(scan.inputs, rate))
+    if "mount" in unsure and scan.check.is_stabilised:
+        config = change(scan.inputs.config, "camera.mount", "gimbal")
+        notes = (*scan.inputs.notes, STABILISED)
+        return Correction("mount", {"config": config, "notes": notes})
     shutter = scan.found_shutter() if "readout" in unsure else None
     if shutter is None:
         return None

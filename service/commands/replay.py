@@ -176,9 +176,10 @@ def _lens(
 
 def _unsure(log: TelemetryLog | None, is_clock_given: bool) -> set[str]:
     """What the images of a recording may correct: then its scan begins again."""
+    of_images = {"readout", "mount"}
     is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
     is_sure = is_of_camera or is_clock_given
-    return {"readout"} if is_sure else {"readout", "clock", "clock's rate"}
+    return of_images if is_sure else of_images | {"clock", "clock's rate"}
 
 
 def _corrected(

@@ -193,6 +193,7 @@ class Scan:
         posed = events[-1]
         assert isinstance(posed, FramePosed)
         self.check.add(time_ns, posed.frame)
+        self.rig.is_stabilised = self.check.is_stabilised
         self.tracking.add(posed.frame, time_ns)
         self.report_blur()
         for doubt in self.pipeline.new_doubts():
@@ -341,7 +342,7 @@ class Scan:
         "view", "level", "height", "altitude", with "pressure" where air pressure gave it, and with
         a narrow view "turn", as vision alone cannot separate it from distance."""
         out = [w for w in self.inputs.assumed if w != "start" or not self.check.is_clock_sure]
-        if self.attitudes == 0:
+        if self.attitudes == 0 or self.check.is_stabilised:
             out.append("view")
         if self.mapper.keyframes.is_levelled:
             out.append("level")

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavlink.telemetry.gimbal import FrameVerdict, frame_by_images
+from mavlink.telemetry.gimbal import FrameVerdict, frame_by_images, is_stabilised
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import KEPT, SURE, LatencyEstimate, LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
@@ -54,6 +54,7 @@ class TelemetryCheck:
         self._in_log: LatencyEstimate | None = None  # in the whole log, when _compared with it
         self._compared: LatencyEstimate | None = None
         self.frame: FrameVerdict | None = None
+        self.is_stabilised = False  # the vehicle's attitude is not the camera's
         self.reported: dict[str, str] = {}  # by subject
         self._history, self._warn = history, warn
         self._fixed = camera.mount == "fixed"
@@ -183,6 +184,7 @@ class TelemetryCheck:
             seen = frame_by_images(self._turns.long_turns, history.claimed_at, latency)
             self.frame = seen or self.frame
             self._judge_frame(history)
+            self._judge_mount(history)
 
     def _report_latency(self, found: LatencyEstimate) -> None:
         text = f"Camera latency {found.latency_ms:.0f} ms by the images"
@@ -202,6 +204,14 @@ class TelemetryCheck:
             self._once("frame", f"{seen}: applied")
         else:
             self._once("frame", f"{seen}; {used.value} is set" if used else seen)
+
+    def _judge_mount(self, history: VehicleHistory) -> None:
+        """Find out that a camera whose gimbal sends nothing is on one."""
+        if self._camera.mount == "auto" and history.gimbal_frame() is None:
+            turns = self._turns.long_turns
+            self.is_stabilised |= is_stabilised(turns, history.body_at, self.applied_ms)
+        if self.is_stabilised:
+            self._once("mount", STABILISED)
 
     def _once(self, subject: str, text: str) -> None:
         if subject not in self.reported:
@@ -225,6 +235,11 @@ class TelemetryCheck:
         gimbal = {"used": used.value if used is not None else None, "by_pictures": seen}
         return {"camera_latency": latency} | ({"gimbal_frame": gimbal} if used is not None else {})
 
+
+STABILISED = (
+    "The images hold still while the vehicle tilts, so its attitude is not the camera's, which is "
+    "taken to look as camera.mount_pitch_deg says"
+)
 
 _WORDS = {
     GimbalFrame.EARTH: "the earth",

@@ -99,6 +99,20 @@ def test_flat_ground_is_followed_without_loss(ground: U8, telemetry: bool) -> No
     assert drift(track, found) < 0.006 * 60.0
 
 
+def test_an_attitude_that_contradicts_the_images_steadily_loses_against_them(ground: U8) -> None:
+    """That of a vehicle which leans into its flight; a gimbal holds the camera still."""
+    track, rng, odometry = poses(60, step_m=1.0), np.random.default_rng(2), Odometry(CAMERA)
+    found = list[Frame]()
+    for i, T in enumerate(track):
+        lean = 0.35 * (1.0 - np.exp(-i / 3.0)) + 0.1 * np.sin(0.5 * i)
+        R = se3.so3_exp(np.array([lean, 0.0, 0.0])) @ T[:3, :3]
+        prior = prior_of(se3.compose(R, T[:3, 3]), rng)
+        found += odometry.track(undistorted(photograph(ground, T), i, i * 100_000_000, prior))
+    assert odometry.segment == 0
+    assert all(f.is_placed for f in found[20:])
+    assert drift(track, found) < 0.006 * 60.0
+
+
 def test_blank_frames_are_bridged_and_named(ground: U8) -> None:
     track = poses(30)
     blank = np.full((360, 480), 120, np.uint8)

@@ -86,9 +86,9 @@ def test_a_video_goes_where_its_images_turn_with_the_log(flight: Path, tmp_path:
 @pytest.mark.parametrize(
     ("options", "unsure"),
     [
-        ([], {"readout", "clock", "clock's rate"}),
-        (["--video-epoch", str(EPOCH_S - 2.5)], {"readout"}),
-        (["--set", "camera.latency_ms=40"], {"readout"}),
+        ([], {"readout", "mount", "clock", "clock's rate"}),
+        (["--video-epoch", str(EPOCH_S - 2.5)], {"readout", "mount"}),
+        (["--set", "camera.latency_ms=40"], {"readout", "mount"}),
         (["--realtime"], set()),
     ],
 )
@@ -127,7 +127,7 @@ def test_a_date_for_a_log_without_one_leaves_its_clock_open(
     monkeypatch.setattr(missing_metadata, "load_log", lambda path, config: log)
     monkeypatch.setattr(replay, "fly", fly)
     replayed(brief, tmp_path / "scan", "--video-epoch", str(EPOCH_S))
-    assert asked == [(round(80e9), {"readout", "clock", "clock's rate"})]
+    assert asked == [(round(80e9), {"readout", "mount", "clock", "clock's rate"})]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -242,6 +243,32 @@ def test_a_gimbal_that_claims_the_wrong_frame_is_corrected_and_reported_once() -
     w, x, y, z = state.q_ned_gimbal_wxyz
     truth = body(30.0) * Rotation.from_euler("Y", -math.pi / 3)
     assert (truth.inv() * Rotation.from_quat([x, y, z, w])).magnitude() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("mount", "held", "is_found"),
+    [("auto", 1.0, True), ("auto", 0.0, False), ("auto", 0.3, False), ("fixed", 1.0, False)],
+)
+def test_a_camera_on_a_gimbal_that_sends_nothing_is_found(
+    mount: Literal["auto", "fixed"], held: float, is_found: bool
+) -> None:
+    """Of the vehicle's tilt the gimbal takes out a share, ``held``."""
+    reported: list[str] = []
+    history = VehicleHistory()
+    check = TelemetryCheck(CameraConfig(mount=mount), history, reported.append)
+
+    def tilted(t: float, share: float) -> Rotation:
+        angles = [0.12 * math.sin(1.9 * t), 0.15 * math.sin(1.3 * t)]
+        return Rotation.from_euler("ZYX", [0.01 * t, *(share * a for a in angles)])
+
+    for k in range(30 * 25):
+        t = k / 25
+        history.add(AttitudeSample(None, quaternion_of(tilted(t, 1.0))), k * S // 25)
+        T = np.eye(4)
+        T[:3, :3] = tilted(t, 1.0 - held).as_matrix() @ R_GIMBAL_CAMERA
+        check.add(k * S // 25 + 150_000_000, seen(Tracking.TRACKED, T))
+    assert check.is_stabilised == is_found
+    assert sum("hold still while the vehicle tilts" in text for text in reported) == is_found
 
 
 def test_a_frame_that_was_configured_stands_against_the_images() -> None:
