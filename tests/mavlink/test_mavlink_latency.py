@@ -42,8 +42,8 @@ def watch_flight(
         first, second = (of_scipy_head(attitude(x, strength), mount) for x in (t, t + step))
         seen = first.inv() * second * Rotation.from_rotvec(rng.normal(0.0, noise_rad, 3))
         x, y, z, w = map(float, seen.as_quat())
-        stamps = (round((at + latency_s + rate * at) * S) for at in (t, t + step))
-        watch.add(*stamps, (w, x, y, z))
+        late, later = (round((at + latency_s + rate * at) * S) for at in (t, t + step))
+        watch.add(late, later, (w, x, y, z))
     return watch
 
 
