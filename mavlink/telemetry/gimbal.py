@@ -165,7 +165,7 @@ def frame_by_images(
     return FrameVerdict(best, bool(rivals) and refuted == tuple(rivals), refuted)
 
 
-LEAST_TURNS = 8
+MIN_STEADY_TURNS = 8
 STEADY_SHARE, SWAYS_RAD, STRAIGHT_ON_RAD = 0.5, math.radians(1.5), math.radians(4.0)
 """A camera tilts by less than this share of what its vehicle tilts by, which tilts by this rms, in
 turns in which the vehicle keeps its heading so well, which the camera may follow."""
@@ -189,7 +189,7 @@ def is_stabilised(
             tilted += 4.0 * (x * x + y * y)
             seen += angle_between(turn, (1.0, 0.0, 0.0, 0.0)) ** 2 - 4.0 * z * z
             count += 1.0
-    is_known = count >= LEAST_TURNS and tilted > SWAYS_RAD**2 * count
+    is_known = count >= MIN_STEADY_TURNS and tilted > SWAYS_RAD**2 * count
     return is_known and seen < STEADY_SHARE**2 * tilted
 
 

@@ -136,7 +136,7 @@ def test_a_recording_whose_clock_gains_shows_its_rate() -> None:
     check = TelemetryCheck(CameraConfig(), history)
     fly(check, rate=rate)
     found = check.clock_rate()
-    assert found == pytest.approx(rate, abs=3e-4)
+    assert found is not None and found == pytest.approx(rate, abs=3e-4)
     assert check.clock_rate() is None  # until there are more frames
     again = TelemetryCheck(CameraConfig(), history.at_rate(found, S))
     fly(again, rate=rate)
