@@ -146,6 +146,17 @@ def test_strips_flown_both_ways_agree_by_the_camera_that_surfaces_keep() -> None
     places = crossings(found.poses, given, seen, len(points))
     off_px = errors_px(given, found.poses, places, seen)
     assert np.quantile(off_px, 0.9) < 1.0  # 2 px by the poses of the camera found
+    assert found.own is given
+
+
+def test_poses_are_of_the_camera_found_where_images_contradict_the_one_given() -> None:
+    poses = _oblique_turn()
+    points, seen = _seen(poses, TRUE)
+    start, near = _guess(points, poses)
+    given = Camera(WRONG.K, TRUE.distortion, SIZE)
+    asked = SelfCalibrationConfig(max_sigma_focal=0.02)
+    found = fitted(given, start, TiedViews(given, start, near, seen), len(poses), asked)
+    assert found.own is found.camera and abs(found.own.K[0, 0] / 960.0 - 1.0) < 0.01
 
 
 def _in_patches(seen: Sightings, amplitude_px: float, seed: int) -> Sightings:
