@@ -5,7 +5,7 @@ size. One adjustment has their poses, the places seen, the telemetry and the sur
 Depth images and textures keep the camera that the scan was flown with, so poses are those of that
 camera, unless the images contradict it: of another one, its centre moved by a pixel, they would lie
 pixels apart where strips are flown both ways. The camera that fits the images best (if observable)
-is found beside them. Each depth image is scaled to the places that it shows.
+is found alongside. Each depth image is scaled to the places that it shows.
 """
 
 from __future__ import annotations
