@@ -199,6 +199,8 @@ class GraphFactors:
         is_new = node.segment != last.segment
         if is_new and to_world is not None and segment.is_tied:
             T = to_world.pose(node.T_odom_camera)
+        elif node.T_prev_segment is not None:
+            T = T_last @ node.T_prev_segment
         else:
             priors = self._segments[last.segment].at_camera(last), segment.at_camera(node)
             T = dead_reckoned(*priors, T_last, self._velocity(last, T_last), passed_s)

@@ -13,12 +13,12 @@ import numpy as np
 
 from recon import parallel, se3
 from recon.posegraph.factors import GraphFactors
-from recon.posegraph.pose_priors import is_frozen, sound, without_fixes
+from recon.posegraph.pose_priors import is_frozen, sound
 from recon.posegraph.records import LOOP_WINDOW, Loop, Node, loops_agree
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
 from recon.posegraph.smoother import MANY_STEPS, STEPS, reversed_motion
-from recon.posegraph.thinning import GONE_SHARE, moved_loops, surplus, thinned
+from recon.posegraph.thinning import GONE_SHARE, moved_loops, thin
 from recon.types import F64, Pose, PosePrior
 
 log = logging.getLogger(__name__)
@@ -253,12 +253,14 @@ class PoseGraph:
 
     def _thin(self) -> None:
         """Interpolate some of the older keyframes between their neighbours, and rebuild."""
-        nodes = without_fixes(list(self._nodes.values()), self._refused())
-        nodes, marginalised = thinned(nodes, surplus(nodes))
+        poses = dict(zip(self._nodes, self._smoother.poses(), strict=False))  # but the newest
+        nodes, marginalised, dropped = thin(list(self._nodes.values()), self._refused(), poses)
+        self._kept_counts["keyframe dropped"] += len(dropped)
         self._nodes = {node.seq: node for node in nodes}
         self.segments.thin(nodes)
         self.loops, self.pending = (
-            moved_loops(loops, marginalised, len(nodes)) for loops in (self.loops, self.pending)
+            moved_loops(loops, marginalised, dropped, len(nodes))
+            for loops in (self.loops, self.pending)
         )
         self._thin_at = max(self.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1

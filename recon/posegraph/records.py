@@ -22,6 +22,7 @@ class Node:
     height: float | None = None  # above the ground that it sees, in odometry units
     slant: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
     weight: int = 1  # keyframes since the node before, this one among them
+    T_prev_segment: F64 | None = None  # (4, 4) m, since the node before, of another segment
 
     @property
     def time_s(self) -> float:

@@ -151,11 +151,16 @@ class Segments:
         return segment
 
     def thin(self, nodes: Iterable[Node]) -> None:
-        """Keep only these nodes."""
+        """Keep only these nodes, and what is known of their segments."""
         for segment in self._all.values():
             segment.nodes = []
         for node in nodes:
             self._all[node.segment].nodes.append(node)
+        for segment in self._all.values():
+            if not segment.nodes:
+                is_tied = segment.is_tied
+                segment.forget()
+                segment.keyframes, segment.is_tied_by_loop = 0, is_tied
 
     def _placed(self) -> list[tuple[Segment, Alignment]]:
         return [(s, s.similarity) for s in self._all.values() if s.similarity is not None]

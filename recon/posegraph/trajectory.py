@@ -11,7 +11,7 @@ from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
 from recon.poses import sigma_m
 from recon.table import Rows, Table
-from recon.types import F64, I64, Pose, PosePrior
+from recon.types import F64, I64, Bool, Pose, PosePrior
 
 REPOSE_M, REPOSE_SIGMAS = 0.05, 0.1
 """In flight a corrected pose is published that moves the keyframe or its ground by more than this,
@@ -27,6 +27,7 @@ SETTLED_M = 1e-6  # at the end, what moved by more is published: rounding errors
 KEYFRAME = np.dtype(
     [
         ("seq", np.int64),
+        ("segment", np.int32),
         ("is_published", np.bool_),
         ("T_odom_camera", np.float64, (4, 4)),  # in the segment's chain
         ("height", np.float64),  # above the ground that it sees, in odometry units
@@ -43,7 +44,8 @@ class Trajectory:
     """Keyframe poses of one scan, and what was published of each.
 
     A keyframe for which the graph has no room is no node of it any more. It is carried by the
-    nodes on both sides, which are of its segment.
+    nodes of its segment on both sides; where the graph dropped its whole segment, it stays as
+    published.
     """
 
     def __init__(self, graph: PoseGraph | None = None) -> None:
@@ -68,7 +70,7 @@ class Trajectory:
         """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`."""
         self.graph.add_keyframe(seq, time_ns, segment, T_odom_camera, covariance, prior, height)
         row = np.zeros(1, KEYFRAME)
-        row["seq"], row["T_odom_camera"] = seq, T_odom_camera
+        row["seq"], row["segment"], row["T_odom_camera"] = seq, segment, T_odom_camera
         row["height"] = height[0] if height is not None and height[0] else 1.0
         self._row[seq] = len(self._table)
         self._table.append(row)
@@ -131,14 +133,23 @@ class Trajectory:
         """(N,) rows of the nodes at or before the rows ``at`` (N,)."""
         return self._nodes[np.searchsorted(self._nodes, at, side="right") - 1]
 
+    def _is_dropped(self, at: I64) -> Bool:
+        """(N,) True for keyframes in rows ``at`` (N,) of whose segment the graph has no node."""
+        segments = self._table.rows["segment"]
+        return np.asarray(segments[self._node_before(at)] != segments[at])
+
     def _placed(self, at: I64) -> tuple[F64, F64]:
         """(N, 4, 4) poses and (N,) scales of the keyframes in the rows ``at`` (N,)."""
         before = np.searchsorted(self._nodes, at, side="right") - 1
         T_nodes, scales_nodes = self.graph.poses(), self.graph.scales()
         T, scales = T_nodes[before], scales_nodes[before]
-        i = np.flatnonzero(self._nodes[before] != at)
+        is_dropped = self._is_dropped(at)
+        i = np.flatnonzero((self._nodes[before] != at) & ~is_dropped)
         if len(i):
             T[i], scales[i] = self._interpolated(at[i], before[i], T_nodes, scales_nodes)
+        i = np.flatnonzero(is_dropped & self._table.rows["is_published"][at])
+        published = self._table.rows[at[i]]
+        T[i], scales[i] = published["T_world_camera"], published["scale"]
         return T, scales
 
     def _interpolated(self, at: I64, before: I64, T_nodes: F64, scales: F64) -> tuple[F64, F64]:
@@ -168,9 +179,12 @@ class Trajectory:
 
     def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
         """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_loop`; ``a`` need not be a node, and
-        then the loop is moved to the node before it, with vision's covariance on the way there."""
+        then the loop is moved to the node before it, with vision's covariance on the way there;
+        False where that node is of another segment."""
         if a not in self.graph:
             row = self._row[a]
+            if self._is_dropped(np.array([row]))[0]:
+                return False  # no node carries it
             i = int(np.searchsorted(self._nodes, row))
             before, after = self.graph.seqs[i - 1], self.graph.node(self.graph.seqs[i])
             T = self.step_between(before, a)
@@ -219,7 +233,8 @@ class Trajectory:
                 for i, seq in enumerate(nodes.tolist())
             ]
             off = np.abs(np.array([sigma_m(pose) for pose in now]) - rows["sigma_m"])
-            far = np.flatnonzero((change > SETTLED_M) | (off > SIGMA_SHARE * rows["sigma_m"]))
+            is_stale = (off > SIGMA_SHARE * rows["sigma_m"]) & ~self._is_dropped(at)
+            far = np.flatnonzero((change > SETTLED_M) | is_stale)
             return {int(rows["seq"][i]): now[i] for i in far}
         far = np.flatnonzero(change > np.maximum(REPOSE_M, REPOSE_SIGMAS * rows["sigma_m"]))
         if len(far) <= AT_ONCE:

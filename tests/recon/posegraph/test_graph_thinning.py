@@ -198,6 +198,13 @@ def test_ends_of_segments_stay() -> None:
             assert (seqs[0], seqs[-1]) == (7 * segment, 7 * segment + 6)
 
 
-def test_segments_of_two_are_their_own_ends() -> None:
-    nodes = [Node(i, i, i, i // 2, np.eye(4), np.eye(6), PosePrior()) for i in range(20)]
-    assert not surplus(nodes)
+def test_of_short_segments_those_that_leave_the_smallest_holes_go_first() -> None:
+    """Two views each, the segments closer and closer to each other; none goes beside a hole."""
+    firsts = np.cumsum([40 - 3 * n for n in range(10)])
+    nodes = [
+        Node(int(firsts[i // 2]) + i % 2, i, i, i // 2, np.eye(4), np.eye(6), PosePrior())
+        for i in range(20)
+    ]
+    gone = surplus(nodes)
+    assert {node.segment for node in nodes if node.seq in gone} == {2, 4, 6}
+    assert len(gone) == 6
