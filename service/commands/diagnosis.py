@@ -40,7 +40,7 @@ CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", 
 DESK = {
     "maps": ("rasterio",),
     "clouds": ("copclib", "py3dtiles"),
-    "meshes": ("open3d", "fast_simplification"),
+    "meshes": ("trimesh", "open3d"),
     "recordings": ("foxglove", "rosbags", "mcap"),
     "flight logs": ("pyulog",),
     "portal": ("starlette", "uvicorn", "websockets"),

@@ -124,7 +124,6 @@ def frame_scores(
     """
     with needing("score --views"):
         import open3d  # noqa: F401
-        import trimesh  # noqa: F401
         from skimage.metrics import structural_similarity
     keyframes, camera = list(main_keyframes(scan.store)), camera_of(scan.store.header)
     products = {**_products(scan, keyframes, camera), **others}

@@ -65,7 +65,7 @@ PACKAGES = (
     | dict.fromkeys(
         ("dsm", "dtm", "ortho", "coverage", "kmz", "stac", "report", "all"), ("rasterio",)
     )
-    | dict.fromkeys(("glb", "obj", "3dtiles-mesh"), ("open3d", "fast_simplification"))
+    | dict.fromkeys(("glb", "obj", "3dtiles-mesh"), ("open3d", "trimesh", "fast_simplification"))
 )
 """Optional packages of kinds."""
 

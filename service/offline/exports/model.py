@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import struct
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +18,7 @@ from recon.surface.raster import grid_over, rasterise
 from recon.surface.texture_views import TextureView, doubled_area, ray_scene
 from recon.surface.texturing import texture
 from recon.surface.volume import volume_mesh
-from recon.types import F64, U8, Array
+from recon.types import F64, U8
 from service.georeference import LocalFrame, map_crs
 from service.offline.exports.images import images_key, opened, recording_for, shared_images
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
@@ -96,6 +94,7 @@ def _mesh_parts(
     with needing("a mesh file"):
         import fast_simplification  # noqa: F401  # before the long work, not after it
         import open3d  # noqa: F401
+        import trimesh  # noqa: F401
     if options.video is not None:
         opened(scan.store.header, options.video).close()  # refused before the work
     count = len(scan.tiling(options, MARGIN_M, on_map=False).tiles)
@@ -235,63 +234,75 @@ def mesh_extras(scan: ScanView) -> dict[str, Any]:
 LARGEST_TEXTURE_PX = 8192
 CLAMP_TO_EDGE, TRILINEAR = 33071, 9987
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-COMPONENTS = {"u1": 5121, "u4": 5125, "f4": 5126}
-UNLIT = "KHR_materials_unlit"
 
 
 def glb(parts: Sequence[tuple[Mesh, U8 | None]], extras: dict[str, Any]) -> bytes:
     """The file's bytes: one mesh per part, each with its image.
 
     An image is (h, w, 3) RGB for the mesh's uv; without one its rgb is used. glTF has y up:
-    x stays east, y is up, z is south. ``extras`` go into the asset. Colours are shown as they are,
-    from both sides.
+    x stays east, y is up, z is south. ``extras`` go into the asset.
     """
-    body, tree = bytearray(), defaultdict[str, list[Any]](list)
-
-    def put(data: bytes, **more: int) -> int:
-        """The number of the data's view of the buffer."""
-        views = tree["bufferViews"]
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data)} | more)
-        body.extend(data + bytes(-len(data) % 4))
-        return len(views) - 1
-
-    def listed(rows: Array, target: int = ARRAY_BUFFER, **more: Any) -> int:
-        """The number of the accessor of rows (N,) or (N, 2 to 4)."""
-        kind = f"VEC{rows.shape[1]}" if rows.ndim == 2 else "SCALAR"
-        view = {"bufferView": put(rows.tobytes(), target=target), "count": len(rows), "type": kind}
-        tree["accessors"].append(view | {"componentType": COMPONENTS[rows.dtype.str[1:]]} | more)
-        return len(tree["accessors"]) - 1
-
+    with needing("a mesh file"):
+        import trimesh
+        from trimesh.exchange.gltf import export_glb
+    scene = trimesh.Scene()
+    textures: list[U8 | None] = []
     for number, (mesh, image) in enumerate(parts):
-        xyz = (mesh.vertices_m[:, [0, 2, 1]] * [1.0, 1.0, -1.0]).astype(np.float32)
-        box = {"min": xyz.min(axis=0).tolist(), "max": xyz.max(axis=0).tolist()}
-        attributes = {"POSITION": listed(xyz, **box)}
-        if mesh.measured is not None:
-            attributes["_MEASURED"] = listed(mesh.measured.astype(np.float32))
-        surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-        if mesh.uv is not None and image is not None:
-            attributes["TEXCOORD_0"] = listed(mesh.uv.astype(np.float32))
-            surface["baseColorTexture"] = {"index": len(tree["textures"])}
-            tree["textures"].append({"source": len(tree["images"]), "sampler": 0})
-            tree["images"].append({"bufferView": put(_jpeg(image)), "mimeType": "image/jpeg"})
-            wrap = {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE, "minFilter": TRILINEAR}
-            tree["samplers"] = [wrap]
-        elif mesh.rgb is not None:
-            rgba = np.column_stack([_linear(mesh.rgb), np.full(len(mesh.rgb), 255, np.uint8)])
-            attributes["COLOR_0"] = listed(rgba, normalized=True)
-        indices = listed(mesh.faces.ravel().astype(np.uint32), ELEMENT_ARRAY_BUFFER)
-        shown = {"attributes": attributes, "indices": indices, "material": number}
-        tree["meshes"].append({"primitives": [shown]})
-        look = {"pbrMetallicRoughness": surface, "extensions": {UNLIT: {}}, "doubleSided": True}
-        tree["materials"].append(look)
-        tree["nodes"].append({"mesh": number, "name": f"surface {number}"})
-    asset = {"version": "2.0", "generator": "skyrelief", "extras": extras}
-    whole = {"asset": asset, "extensionsUsed": [UNLIT], "buffers": [{"byteLength": len(body)}]}
-    scene = {"scene": 0, "scenes": [{"nodes": [*range(len(parts))]}]}
-    head = json.dumps(whole | scene | tree, separators=(",", ":")).encode("ascii")
-    chunks = (b"JSON", head + b" " * (-len(head) % 4)), (b"BIN\0", bytes(body))
-    data = b"".join(struct.pack("<I4s", len(one), name) + one for name, one in chunks)
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(data)) + data
+        textures.append(image if mesh.uv is not None else None)
+        scene.add_geometry(_geometry(mesh, textures[-1] is not None), f"surface {number}")
+
+    def add_textures(buffers: Any, tree: dict[str, Any]) -> None:
+        tree["materials"] = []
+        for number, image in enumerate(textures):
+            tree["meshes"][number]["primitives"][0]["material"] = number
+            surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+            if image is not None:
+                tree["images"].append({"bufferView": len(buffers), "mimeType": "image/jpeg"})
+                buffers[f"image {number}"] = _jpeg(image)
+                surface["baseColorTexture"] = {"index": len(tree["textures"])}
+                tree["textures"].append({"source": len(tree["images"]) - 1, "sampler": 0})
+            # Unlit and double-sided: the image's colours are shown from both sides.
+            unlit: dict[str, Any] = {"KHR_materials_unlit": {}}
+            material = {"pbrMetallicRoughness": surface, "extensions": unlit, "doubleSided": True}
+            tree["materials"].append(material)
+        if tree["textures"]:
+            wrap = {"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+            tree["samplers"] = [wrap | {"minFilter": TRILINEAR}]
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        tree["asset"] |= {"generator": "skyrelief", "extras": extras}
+
+    hooks = {"buffer_postprocessor": add_textures, "tree_postprocessor": _name_uses}
+    return bytes(export_glb(scene, include_normals=False, **hooks))
+
+
+def _name_uses(tree: dict[str, Any]) -> None:
+    """Mark each view of the buffer that holds vertices or their numbers."""
+    accessors, views = tree["accessors"], tree["bufferViews"]
+    for mesh in tree["meshes"]:
+        for one in mesh["primitives"]:
+            for accessor in one["attributes"].values():
+                views[accessors[accessor]["bufferView"]]["target"] = ARRAY_BUFFER
+            views[accessors[one["indices"]]["bufferView"]]["target"] = ELEMENT_ARRAY_BUFFER
+
+
+def _geometry(mesh: Mesh, textured: bool) -> Any:
+    """The mesh in glTF's axes with uv, or else colours, at its vertices."""
+    from trimesh import Trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    xyz = mesh.vertices_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    made: Any = Trimesh(xyz, mesh.faces, process=False)
+    if mesh.measured is not None:
+        made.vertex_attributes["_MEASURED"] = mesh.measured.astype(np.float32)
+    if textured and mesh.uv is not None:
+        uv = mesh.uv.astype(np.float64)
+        uv[:, 1] = 1.0 - uv[:, 1]  # trimesh counts v upwards
+        made.visual = TextureVisuals(uv, material=PBRMaterial())
+    elif mesh.rgb is not None:
+        opaque = np.full(len(mesh.rgb), 255, np.uint8)
+        made.visual.vertex_colors = np.column_stack([_linear(mesh.rgb), opaque])
+    return made
 
 
 def _linear(rgb: U8) -> U8:
@@ -302,7 +313,7 @@ def _linear(rgb: U8) -> U8:
 
 
 def _jpeg(rgb: U8) -> bytes:
-    """The texture as JPEG, at most LARGEST_TEXTURE_PX a side."""
+    """The texture as JPEG, at most LARGEST_TEXTURE_PX a side, padded to whole words."""
     scale = LARGEST_TEXTURE_PX / max(rgb.shape[:2])
     if scale < 1.0:
         size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
@@ -310,7 +321,7 @@ def _jpeg(rgb: U8) -> bytes:
     # Charts lie beside each other by chance: with fewer colours than texels they would mix.
     whole = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
     _, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92, *whole])
-    return data.tobytes()
+    return data.tobytes() + b"\0" * (-data.size % 4)
 
 
 SPAN_M = 1000.0
