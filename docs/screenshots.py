@@ -100,7 +100,7 @@ def main(output: Path) -> None:
             base = portal.url.split("/?")[0]
             browser.open(f"{base}/#/view/{scan.parent.name}/{scan.name}")
             browser.wait("Number(document.body.dataset.points) > 0", LOAD_S)
-            browser.run(BUTTON.format("Surface"))  # as it is in flight: a finished scan has its mesh
+            browser.run(BUTTON.format("Surface"))  # as in flight: a finished scan has its mesh
             browser.run(BUTTON.format("Whole site"))
             browser.wait(WHOLE, LOAD_S)
             shot(browser, "portal-view")

@@ -71,6 +71,29 @@ def test_writes_disparity_in_pixels(
     assert drawn.shape == (80, 160, 3)
 
 
+@pytest.mark.parametrize("lower_px", [0.0, 0.3, 1.5, -2.0])
+def test_rows_that_lie_apart_are_brought_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], lower_px: float
+) -> None:
+    """The right image is turned by 0.1 degrees as well, about its left border's middle."""
+    canvas = np.random.default_rng(0).normal(128, 90, (340, 500)).astype(np.float32)
+    canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), 1.3))
+    v, u = (one.astype(np.float32) for one in np.mgrid[0:240, 0:320])
+    turn = np.float32(0.0 if abs(lower_px) < 1.0 else 0.0017)
+    names = tmp_path / "left.png", tmp_path / "right.png"
+    there = u + 70, v + 50 - np.float32(lower_px) - turn * u
+    for name, (x, y) in zip(names, ((u + 70 - np.float32(9.5), v + 50), there), strict=True):
+        image = cv2.remap(canvas, x, y, cv2.INTER_CUBIC)
+        cv2.imwrite(str(name), np.clip(image, 0, 255).astype(np.uint8))
+    words = ("stereo", *names, "--labels", 16, "--out", tmp_path / "d.npy", "--backend", "cpu")
+    assert run(*words, "--json") == 0
+    report = json.loads(capsys.readouterr().out.splitlines()[-1])
+    seen = lower_px + float(turn) * 160 if turn else 0.0  # less than half a pixel stays
+    assert report["rows_px"] == pytest.approx(seen, abs=0.15)
+    off = np.abs(np.load(tmp_path / "d.npy")[8:-8, 20:-8] - 9.5)
+    assert np.nanmean(off < 0.5) > 0.98 and np.isfinite(off).mean() > 0.95
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
