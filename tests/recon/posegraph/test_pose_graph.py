@@ -20,7 +20,6 @@ from recon.similarity import umeyama
 from recon.types import F64, Pose, PosePrior
 
 STEP_M = 6.0
-# The noise of these flights is white, unlike real sensors'.
 
 
 @dataclass
