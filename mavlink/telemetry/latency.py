@@ -122,7 +122,7 @@ class LatencyWatch:
         if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
             return None
         track = Attitudes(attitudes)
-        seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
+        seen = self._turns(track)
         is_late: Bool = seen.start_s > 0.5 * (seen.start_s[:1] + seen.end_s[-1:])
         early, late = (self._of(seen.only(mask), track, 0.0) for mask in (~is_late, is_late))
         if early is None or late is None or min(early.correlation, late.correlation) < SURE:
@@ -137,7 +137,7 @@ class LatencyWatch:
         if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
             return None
         track = Attitudes(attitudes)
-        seen = self._turns(track.base_ns, max(FAR_WINDOW_S, 2.0 * track.spacing_s)).apart()
+        seen = self._turns(track, FAR_WINDOW_S).apart()
         if len(seen) < MIN_WINDOWS:
             return None
         low = max(float(seen.start_s[0]) - track.last_s, -FAR_REACH_S)
@@ -152,7 +152,7 @@ class LatencyWatch:
 
     def _about(self, track: Attitudes, about_s: float) -> LatencyEstimate | None:
         """The latency within ``REACH_S`` of ``about_s``."""
-        seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
+        seen = self._turns(track)
         return self._of(seen, track, about_s)
 
     @staticmethod
@@ -168,10 +168,12 @@ class LatencyWatch:
             return None
         return _refine(seen.only(best.good), track, float(lag_s))
 
-    def _turns(self, base_ns: int, window_s: float) -> _Turns:
-        """Rotations over ``window_s`` or a little more, four per window."""
+    def _turns(self, track: Attitudes, window_s: float = WINDOW_S) -> _Turns:
+        """Rotations over ``window_s``, or two of the track's attitudes, or a little more, four per
+        window."""
+        window_s = max(window_s, 2.0 * track.spacing_s)
         run = np.array([frame[0] for frame in self._frames])
-        time_s: F64 = np.array([(frame[1] - base_ns) * 1e-9 for frame in self._frames])
+        time_s: F64 = np.array([(frame[1] - track.base_ns) * 1e-9 for frame in self._frames])
         q: F64 = np.array([frame[2] for frame in self._frames], np.float64)
         i = np.arange(len(run))
         j = np.minimum(np.searchsorted(time_s, time_s + 0.99 * window_s), len(run) - 1)

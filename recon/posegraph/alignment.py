@@ -244,7 +244,7 @@ class _Solution:
     at: Alignment
     H: F64
     cost: float
-    variance_factor: float  # variance factor of the fixes: 1 where they differ as their noise says
+    variance_factor: float  # of the fixes: 1 where they differ as their noise says
 
 
 def _solve(readings: AlignmentReadings, at: Alignment, settled: float) -> _Solution:
