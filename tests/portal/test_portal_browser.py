@@ -126,6 +126,7 @@ def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
     browser.page.select_option('[aria-label="colour by"]', "height")
     browser.click("Make mesh")
     browser.wait("document.body.dataset.mesh === 'shown'", 60)
+    browser.page.wait_for_timeout(2500.0)  # the page has looked again what there is
     names = "[...document.querySelectorAll('.tools button')].map(b => b.textContent)"
     assert "Mesh" in browser.run(names) and "Make tiles" in browser.run(names)
     colour = (

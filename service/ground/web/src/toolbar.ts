@@ -30,6 +30,7 @@ export interface Parts {
   id: { drone: string; scan: string };
   /** The scan as last heard of. */
   known: () => api.Scan;
+  learn: (scan: api.Scan) => void;
 }
 
 /** Everything right of the title; `refresh` takes in what is known of the scan. */
@@ -270,7 +271,7 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): { elements: HTMLEle
     button.onclick = async () => {
       button.disabled = true;
       try {
-        await made(product, parts);
+        parts.learn(await made(product, parts));
         button.textContent = name;
         await load();
       } catch (error) {
@@ -304,12 +305,12 @@ function fits({ files }: api.Scan): boolean {
   return bytes < (isPhone ? MAX_PHONE_BYTES : MAX_UNASKED_BYTES);
 }
 
-/** Makes a product unless it is there. */
-async function made({ kind, has }: Product, { id }: Parts): Promise<void> {
+/** Makes a product unless it is there; gives the scan that has it. */
+async function made({ kind, has }: Product, { id }: Parts): Promise<api.Scan> {
   const scan = await api.scan(id.drone, id.scan);
-  if (has(scan)) return;
+  if (has(scan)) return scan;
   await api.make(scan, kind);
-  await api.finished(scan, kind);
+  return api.finished(scan, kind);
 }
 
 function settings({ stage, cloud, ruler }: Parts): HTMLElement {

@@ -105,7 +105,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   stage.addAgain(cloud.group);
   stage.add(cloud.ground.mesh);
   host.append(compass(stage));
-  const tools = toolbar({ ...site, ruler, notes, legend, coverage, time, finished: () => link.finished, known: () => known });
+  const tools = toolbar({ ...site, ruler, notes, legend, coverage, time, finished: () => link.finished, known: () => known, learn });
   bar.append(menuOf(bar, tools.element), tools.element);
   if (awaited(scan)) ruler.toggle();
 
