@@ -114,7 +114,7 @@ class Jobs:
         self.ended: Callable[[Job], None] = lambda _: None
         """Called with each job that has ended, but not by the end of the station."""
         self._worker: Worker | None = None  # while jobs wait
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()  # of a job that is asked for, and of the end
         self._jobs: list[Job] = []  # replaced, not changed, so that anybody may iterate over it
         self._number = 0
         self._is_closed = False
@@ -145,6 +145,7 @@ class Jobs:
                 is_before = may_begin is not None and job.state == "running"  # of an older scan
                 if (job.folder, job.kind, job.options) == asked and not is_before:
                     job.may_begin = job.may_begin and may_begin
+                    self._lock.notify()
                     return job.shown()
             alike = [job for job in current if (job.may_begin is None) == (may_begin is None)]
             if len(alike) >= MAX_WAITING_JOBS:
@@ -159,6 +160,7 @@ class Jobs:
             self._jobs = [*older, *self._jobs[-KEPT:], job]
             if self._worker is None or self._worker.is_done:
                 self._worker = self._workers.start("exports", self._work)
+            self._lock.notify()
             return job.shown()
 
     def of(self, folder: Path) -> list[dict[str, Any]]:
@@ -202,6 +204,7 @@ class Jobs:
                 job.progress.cancel()
                 if job.state == "waiting":
                     job.end("cancelled")
+            self._lock.notify()
             worker = self._worker
         if worker is not None:
             worker.join(CLOSE_S)
@@ -216,12 +219,12 @@ class Jobs:
                 # What is asked for first; the others wait for the same.
                 job = min(waiting, key=lambda job: job.may_begin is not None)
                 begins = job.may_begin is None or job.may_begin()
-                if begins:
-                    job.state = "running"
-            if not begins:
-                if worker.stop.wait(LOOK_S):
-                    return
-                continue
+                if not begins:
+                    self._lock.wait(LOOK_S)
+                    if worker.stop.is_set():
+                        return
+                    continue
+                job.state = "running"
             job.progress.begin()
             guarded("exports", partial(self._run, job))
             if job.state == "failed" and job.may_begin is not None:

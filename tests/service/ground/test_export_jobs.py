@@ -122,6 +122,19 @@ def test_what_nobody_asked_for_waits_for_all_others(tmp_path: Path) -> None:
     assert until(lambda: order[3:] == ["glb"] and not jobs.busy(folder))
 
 
+def test_what_is_asked_for_begins_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while what nobody asked for waits to be looked at again."""
+    monkeypatch.setattr("service.ground.state.LOOK_S", 60.0)
+    looked = threading.Event()
+    jobs = Jobs(Workers(), lambda job: f"scan.{job.kind}")
+    jobs.start(tmp_path, "glb", may_begin=lambda: looked.set() is not None)
+    assert looked.wait(10.0)
+    jobs.start(tmp_path, "kml")
+    assert until(lambda: not jobs.busy(tmp_path))
+    jobs.start(tmp_path, "glb")  # the one that waits
+    assert until(lambda: [job["state"] for job in jobs.of(tmp_path)] == ["done", "done"])
+
+
 def test_what_nobody_asked_for_fails_in_silence(tmp_path: Path) -> None:
     def carry_out(job: Job) -> str:
         raise InputError("there is too little surface")
