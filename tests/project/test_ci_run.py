@@ -87,6 +87,7 @@ def run(project: Path, core: bool = True, works: bool = True) -> subprocess.Comp
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_did_not_run_yet_runs_then(machine: Path) -> None:
     done = run(machine)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -95,6 +96,7 @@ def test_what_did_not_run_yet_runs_then(machine: Path) -> None:
     assert "4 passed, 1 deselected" in second  # the slow one, and those that ffmpeg kept back
 
 
+@pytest.mark.slow
 def test_what_cannot_be_installed_is_named(machine: Path) -> None:
     (machine.parent / "tools" / "id").write_text("#!/bin/bash\necho 1000\n")
     done = run(machine)
@@ -102,6 +104,7 @@ def test_what_cannot_be_installed_is_named(machine: Path) -> None:
     assert "1 passed, 3 skipped, 1 deselected" in done.stdout.partition("run yet")[2]
 
 
+@pytest.mark.slow
 def test_a_test_that_is_late_has_a_second_try(machine: Path) -> None:
     late = "tries = []\ndef test_late():\n    tries.append(1)\n    assert tries[1:]\n"
     (machine / "tests" / "test_late.py").write_text(late)
@@ -111,6 +114,7 @@ def test_a_test_that_is_late_has_a_second_try(machine: Path) -> None:
     assert "1 rerun" in first and re.search(r"^\| all \| 5 \| \d+ \| 1 \|", rest, re.MULTILINE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["core", "works"])
 def test_a_failure_of_either_run_fails_it(machine: Path, broken: str) -> None:
     assert run(machine, **{broken: False}).returncode == 1

@@ -65,6 +65,7 @@ def test_the_configuration_reference_is_up_to_date() -> None:
     assert all(f"| `{field.name}` |" in page for _, field in keys())
 
 
+@pytest.mark.slow
 def test_the_images_of_the_concepts_are_up_to_date() -> None:
     module = script("concepts")
     assert text_of(module.IMAGES / "frame_life.svg") == module.life(), "run make pages"

@@ -227,6 +227,7 @@ def test_the_odometry_sees_level_ground_through_a_rolling_shutter(flown: list[U8
     assert known < 0.12 and ignored > 4 * known
 
 
+@pytest.mark.slow
 def test_frames_after_the_first_tell_how_its_rows_moved(flown: list[U8]) -> None:
     """Telemetry's turn is a tenth of a second late."""
     rolling = replace(PLAIN, shutter=Shutter(0.03))

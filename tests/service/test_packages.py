@@ -45,6 +45,7 @@ def without_libusb(folder: Path, *command: str) -> subprocess.CompletedProcess[s
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_doctor_names_the_debian_package(tmp_path: Path) -> None:
     given = ("--set", f"scan.folder={tmp_path}", "--set", "compute.backend=cpu")
     done = without_libusb(tmp_path, *CLI, "doctor", "--json", *given)
@@ -55,6 +56,7 @@ def test_doctor_names_the_debian_package(tmp_path: Path) -> None:
     assert "apt install" in found[0]["text"] and "libusb-1.0-0" in found[0]["text"]
 
 
+@pytest.mark.slow
 def test_a_command_without_its_library_ends_with_one_line(
     tmp_path: Path, house: HouseFlight
 ) -> None:

@@ -113,6 +113,7 @@ def test_a_focal_length_two_percent_off_is_found_on_an_oblique_turn() -> None:
     assert found.camera.size_px == SIZE
 
 
+@pytest.mark.slow
 def test_a_lens_off_its_axis_is_found_where_turned_views_meet() -> None:
     """Decentred as a consumer's camera was found to be; the flight turns over ground seen twice."""
     bent = Camera(
@@ -198,6 +199,7 @@ def test_the_sigma_holds_where_the_sightings_of_a_view_err_alike(
     assert 0.3 < np.sqrt(np.mean(np.square(sigmas))) < 1.2
 
 
+@pytest.mark.slow
 def test_straight_down_from_one_height_it_is_not_determined() -> None:
     poses = _nadir((60.0, 60.0))
     points, seen = _seen(poses, TRUE)

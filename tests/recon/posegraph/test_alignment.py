@@ -321,6 +321,7 @@ def test_a_rangefinder_that_meets_trees_does_not_move_the_scale() -> None:
     assert found.scale == pytest.approx(2.0, rel=0.004)
 
 
+@pytest.mark.slow
 def test_fixes_that_err_by_more_than_they_claim_leave_the_scale_as_unsure_as_they_scatter() -> None:
     """Ten are too few to measure their noise by."""
     off = []

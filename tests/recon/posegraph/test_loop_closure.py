@@ -82,6 +82,7 @@ A = camera(0.0, 0.0, 40.0, 0.0)
 LEVEL = np.array([[x, y, 40.0] for x in np.linspace(-28, 28, 9) for y in np.linspace(-15, 15, 7)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw", [0.1, 1.6, 3.1])
 def test_a_place_seen_again_is_found_from_any_side(yaw: float) -> None:
     B = camera(5.0, -3.0, 41.0, yaw)
@@ -278,6 +279,7 @@ def test_a_loop_joins_the_scales_of_its_ends() -> None:
     assert abs(graph.scale(55) / graph.scale(4) * DRIFT - 1.0) < 0.003
 
 
+@pytest.mark.slow
 def test_a_segment_that_loops_shrink_tells_by_how_much() -> None:
     """Fixes to centimetres lay the first ten keyframes into 0.9 of their size; two loops hand that
     on to all others, whose own fixes of 3 m give 1."""

@@ -160,6 +160,7 @@ def test_reported_covariance_holds() -> None:
     assert 4.0 < np.mean(middle) < 8.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use", ["vision", "vision attitude"])
 def test_without_fixes_the_frame_stays_local_and_drift_is_small(use: str) -> None:
     f = flight(120, scale=1.0)
@@ -357,6 +358,7 @@ def test_without_fixes_a_gap_is_bridged_at_the_last_velocity(burst_ns: int) -> N
     assert np.sqrt(np.trace(pose.covariance[3:, 3:])) > 5.0
 
 
+@pytest.mark.slow
 def test_without_fixes_the_barometer_goes_on_over_a_gap() -> None:
     """Each segment has an origin of its own; the second begins 25 m higher."""
     f = flight(70, scale=1.0, turn_every=100)

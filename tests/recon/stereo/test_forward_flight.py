@@ -143,6 +143,7 @@ def test_two_images_are_matched_once(
     assert len({frozenset(pair) for pair in rectified}) == len(rectified)
 
 
+@pytest.mark.slow
 def test_sigma_grows_with_the_distance(keyframes: list[Keyframe]) -> None:
     """On a plane that fills with the distance: once for it, once for the angle to the epipole."""
     depth = keyframes[1].depth

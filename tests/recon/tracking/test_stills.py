@@ -79,6 +79,7 @@ def test_stills_at_60_percent_overlap_are_one_piece(yaw_deg: float) -> None:
     assert_one_piece(track, flown([still(T) for T in track]), 0.02)
 
 
+@pytest.mark.slow
 def test_a_time_lapse_is_one_piece() -> None:
     """Video of a tenth of a second a frame that jumps and turns as stills do."""
     track = [pose(0.3 * FOOTPRINT_M * (i - 2), 60.0 * (i % 3), seed=i) for i in range(5)]

@@ -334,12 +334,14 @@ def test_open_scans_are_closed_after_a_crash(tmp_path: Path) -> None:
     assert close_open_scans(tmp_path, ()) == []
 
 
+@pytest.mark.slow
 def test_a_scan_left_open_is_found_whatever_the_clock_says(tmp_path: Path) -> None:
     left = scan(tmp_path, "20990101T000000Z", finished=False)
     os.utime(left / "scan.db", (4e9, 4e9))  # the clock is behind that since the power cut
     assert close_open_scans(tmp_path, ()) == [left.name]
 
 
+@pytest.mark.slow
 def test_a_second_service_leaves_the_scans_of_the_first_alone(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

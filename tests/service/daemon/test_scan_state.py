@@ -571,6 +571,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.folder.cleanup()
 
 
+@pytest.mark.slow
 def test_any_order_of_commands_and_faults() -> None:
     gc.freeze()  # each end of a scan collects garbage
     try:

@@ -321,6 +321,7 @@ def test_an_unreadable_folder_loses_nothing(flight: Path, tmp_path: Path) -> Non
     assert done.returncode == 2 and "closed" in done.stderr
 
 
+@pytest.mark.slow
 def test_memory_is_pooled_before_anything_large_is_loaded() -> None:
     script = (
         "import sys\n"

@@ -204,6 +204,7 @@ def test_auto_applies_what_was_found_and_keeps_the_frames_in_order() -> None:
     assert again.exposed_ns(S) == S - 70_000_000  # what the last scan found serves at once
 
 
+@pytest.mark.slow
 def test_a_right_setting_needs_no_words_and_can_change_in_flight() -> None:
     reported: list[str] = []
     check = TelemetryCheck(
@@ -218,6 +219,7 @@ def test_a_right_setting_needs_no_words_and_can_change_in_flight() -> None:
     assert check.applied_ms == pytest.approx(20.0 + 100.0 / 15, abs=0.1) and after > before
 
 
+@pytest.mark.slow
 def test_a_calm_flight_is_given_no_latency() -> None:
     reported: list[str] = []
     check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 0.0), reported.append)
@@ -288,6 +290,7 @@ def test_an_honest_gimbal_is_left_alone() -> None:
     assert not any("Gimbal" in text for text in reported)
 
 
+@pytest.mark.slow
 def test_skipped_frames_do_not_interrupt_the_turns_of_the_others() -> None:
     """Frames that were not tracked come between those that were."""
     check = TelemetryCheck(CameraConfig(), history_of("honest", 1.0))

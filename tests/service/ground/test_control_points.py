@@ -233,6 +233,7 @@ def test_a_large_file_is_taken_and_one_with_too_many_points_refused(
     assert [p["name"] for p in client.ask(POINTS)[1]["points"]] == ["A"]
 
 
+@pytest.mark.slow
 def test_a_mark_too_many_leaves_the_points_as_they_are(house: HouseFlight, tmp_path: Path) -> None:
     """Else none could be listed, and no mark taken away."""
     lat, lon, alt = house.origin

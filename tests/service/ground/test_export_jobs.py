@@ -126,8 +126,13 @@ def test_what_is_asked_for_begins_at_once(tmp_path: Path, monkeypatch: pytest.Mo
     """Also while what nobody asked for waits to be looked at again."""
     monkeypatch.setattr("service.ground.state.LOOK_S", 60.0)
     looked = threading.Event()
+
+    def may_begin() -> bool:
+        looked.set()
+        return False
+
     jobs = Jobs(Workers(), lambda job: f"scan.{job.kind}")
-    jobs.start(tmp_path, "glb", may_begin=lambda: looked.set() is not None)
+    jobs.start(tmp_path, "glb", may_begin=may_begin)
     assert looked.wait(10.0)
     jobs.start(tmp_path, "kml")
     assert until(lambda: not jobs.busy(tmp_path))

@@ -100,6 +100,7 @@ def test_few_of_one_address_are_in_their_handshake(front: tuple[Front, int]) -> 
         until(lambda: sum(_is_ended(one) for one in calls) == 1)
 
 
+@pytest.mark.slow
 def test_who_takes_no_bytes_and_ends_keeps_no_connection(front: tuple[Front, int]) -> None:
     address, _, port = front[0].inner.partition("/")[2].partition(":")
     with (

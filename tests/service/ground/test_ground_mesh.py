@@ -121,6 +121,7 @@ def test_meshes_that_did_not_fit_or_were_cut_off_are_made_later(
         second.close()
 
 
+@pytest.mark.slow
 def test_a_scan_that_ended_without_a_portal_gets_its_mesh_by_a_later_one(
     folder: Path, tmp_path: Path
 ) -> None:

@@ -113,6 +113,7 @@ def test_its_place_is_as_good_as_its_sigma_says(
     assert (after.sigma_m < 0.8 * before.sigma_m).all()
 
 
+@pytest.mark.slow
 def test_a_scan_that_meets_no_other_stays_where_its_fixes_put_it(tmp_path: Path) -> None:
     ground = write_scan(tmp_path / "ground", NORTH[:3])
     flight, site = Flight(tmp_path / "winter", leg(np.pi / 2, 3), OTHER, ground=2), LiveSite()

@@ -200,6 +200,7 @@ def test_level_ground_with_a_house_has_no_contours(maps: Path) -> None:
     assert contours_gpkg(maps / "contours.gpkg") == contours_dxf(maps / "contours.dxf") == []
 
 
+@pytest.mark.slow
 def test_the_report_shows_orthophoto_and_surface_model(tmp_path: Path, house: HouseFlight) -> None:
     folder = tmp_path / "scan"
     with house.flown(folder) as store:

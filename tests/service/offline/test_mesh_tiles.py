@@ -257,6 +257,7 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
     assert isinstance(failed.exception, InputError)
 
 
+@pytest.mark.slow
 def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFlight) -> None:
     folder = tmp_path / "scan"
     with house.flown(folder) as store:

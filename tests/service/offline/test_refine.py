@@ -218,6 +218,7 @@ def test_control_points_bring_map_and_track_to_their_place(flight: Flight) -> No
     assert any("control points" in note for note in summary["notes"])
 
 
+@pytest.mark.slow
 def test_marks_by_time_and_points_of_the_cloud_count_too(flight: Flight) -> None:
     rows = []
     for name, (x, y) in SPOTS.items():
@@ -277,6 +278,7 @@ def test_the_same_input_twice_changes_nothing_and_undo_brings_all_back(flight: F
     assert refine(flight.scan, RefineOptions(gcp))["changed"]
 
 
+@pytest.mark.slow
 def test_loops_of_the_flight_hold_both_legs_together(tmp_path: Path) -> None:
     flight = fly(tmp_path)
     pairs = [(1, 14), (4, 11), (6, 9)]
@@ -351,6 +353,7 @@ def flat_errors(flight: Flight) -> F64:
     return np.array(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("placed", [True, False])
 def test_points_without_heights_place_a_scan_horizontally(tmp_path: Path, placed: bool) -> None:
     flight = fly(tmp_path, placed)
@@ -363,6 +366,7 @@ def test_points_without_heights_place_a_scan_horizontally(tmp_path: Path, placed
     assert "vertically" not in json.loads((flight.scan / "scan.json").read_text())["notes"][-1]
 
 
+@pytest.mark.slow
 def test_the_command_prints_points_without_heights(flight: Flight) -> None:
     gcp = write_csv(flight.folder / "flat.csv", flight.survey(SPOTS, alt_amsl_m=""))
     answer = CliRunner().invoke(app, ["refine", str(flight.scan), "--gcp", str(gcp)])
@@ -440,6 +444,7 @@ def test_an_outlier_is_refused_and_named(
     assert errors(flight).max() < 0.2
 
 
+@pytest.mark.slow
 def test_a_point_two_metres_off_is_distinguished_from_the_others(flight: Flight) -> None:
     rows = flight.survey(SPOTS)
     for row in rows:

@@ -91,6 +91,7 @@ def test_a_scan_without_a_place_takes_its_images_along(tmp_path: Path) -> None:
         assert isinstance(refused.exception, InputError) and why in str(refused.exception)
 
 
+@pytest.mark.slow
 def test_a_video_of_something_else_changes_nothing(tmp_path: Path) -> None:
     scan = made(tmp_path, flown())
     for path in (tmp_path / "stills").iterdir():

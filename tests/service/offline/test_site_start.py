@@ -80,6 +80,7 @@ def test_three_points_and_the_surface_place_a_scan(
     assert np.linalg.norm(errors_m(site, 0, NORTH)[:, :2].mean(axis=0)) < 0.3
 
 
+@pytest.mark.slow
 def test_points_are_remembered_when_the_site_is_aligned_again(
     scans: tuple[Path, Path], tmp_path: Path
 ) -> None:

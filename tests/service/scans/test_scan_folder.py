@@ -361,6 +361,7 @@ def test_without_a_cloud_the_track_is_still_written(
     assert "Unable to allocate" in (tmp_path / SUMMARY).read_text()
 
 
+@pytest.mark.slow
 def test_a_file_that_the_disk_refused_is_tried_again_at_the_next_start(
     tmp_path: Path, house: HouseFlight
 ) -> None:

@@ -106,6 +106,7 @@ def test_live_command_pipes_the_video(flight: Path) -> None:
     assert json.loads(done.stderr.decode().strip().splitlines()[-1])["frames"] == 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("address", ["nowhere", "127.0.0.1:0", "127.0.0.1:http", ":14550"])
 def test_wrong_addresses_are_refused(address: str, flight: Path) -> None:
     arguments = ["simulate", "--out", str(flight), "--live", "--mavlink-to", address]

@@ -203,6 +203,7 @@ def fly(sender: TunnelSender, store: ScanStore, seconds: float) -> list[tuple[fl
     return sent
 
 
+@pytest.mark.slow
 def test_a_map_of_100_m_arrives_in_flight_within_the_share(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     with (
