@@ -61,6 +61,40 @@ def sharpness(gray: U8) -> float:
     return fine / coarse if coarse > 0 else float("nan")
 
 
+FINEST_PX, MIN_APART_PX, MAX_APART_PX = 0.3, 0.55, 6.0
+"""Sigmas of a blur: the narrowest that changes an image, that of which two images of one scene may
+differ, and the widest that is sought."""
+
+
+def blur_apart(left: U8, right: U8) -> float:
+    """Sigma in px of the blur that makes the sharper of two gray images (h, w) of one scene as
+    blurred as the other; negative where ``right`` is the sharper one, 0 where both are as sharp."""
+    detail = _fine_detail(left), _fine_detail(right)
+    if not np.isfinite(detail).all():
+        return 0.0
+    sharper, least = (left, detail[1]) if detail[0] > detail[1] else (right, detail[0])
+    low, high = FINEST_PX, MAX_APART_PX
+    while high - low > 0.05:
+        middle = 0.5 * (low + high)
+        is_sharper = _fine_detail(blurred(sharper, middle)) > least
+        low, high = (middle, high) if is_sharper else (low, middle)
+    if low < MIN_APART_PX:
+        return 0.0
+    return low if sharper is left else -low
+
+
+def blurred(gray: U8, sigma_px: float) -> U8:
+    """The image (h, w) blurred by a Gaussian."""
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), sigma_px), np.uint8)
+
+
+def _fine_detail(gray: U8) -> float:
+    """Like :func:`sharpness`, at the image's own size: it falls with any blur."""
+    fine, coarse = (cv2.Laplacian(one, cv2.CV_16S) for one in (gray, blurred(gray, 2.0)))
+    rough = cv2.norm(coarse, cv2.NORM_L1)
+    return cv2.norm(fine, cv2.NORM_L1) / rough if rough > 0 else float("nan")
+
+
 BLURRED_SHARE = 0.6  # of the median sharpness of the last images: less is blurred
 BLUR_WINDOW, MIN_KNOWN = 31, 5  # images that the median is of, at most and at least
 

@@ -137,22 +137,13 @@ class ImagesSource(CameraSource):
 
         if self._black_white is None:
             some = (one for one in map(_deep, self._some) if one is not None)  # one is held
-            ends = [_ends(one) for one in some if one.dtype == image.dtype] or [_ends(image)]
-            self._black_white = low, high = black_and_white(ends)
-            if not self._is_photo(image):
+            ends = [ends_of(one) for one in some if one.dtype == image.dtype] or [ends_of(image)]
+            self._black_white = black_and_white(ends)
+            if not is_photo(image, self._black_white):
+                low, high = self._black_white
                 self._warn(f"levels of the images from {low:.5g} to {high:.5g} are black to white")
-        low, high = self._black_white
-        if self._is_photo(image):
-            shown = (image >> 8).astype(np.uint8)
-        else:
-            with np.errstate(over="ignore", invalid="ignore"):  # foreign floats may be any
-                share = (image.astype(np.float32) - low) * (255.0 / (high - low))
-            shown = np.nan_to_num(share).clip(0.0, 255.0).astype(np.uint8)
+        shown = levels(image, self._black_white)
         return shown if shown.ndim == 3 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR))
-
-    def _is_photo(self, image: Array) -> bool:
-        low, high = self._black_white or (0.0, 0.0)
-        return image.dtype == np.uint16 and high - low > WIDE
 
     @property
     def images(self) -> int:
@@ -573,7 +564,7 @@ def _decoded(path: Path, flags: int) -> Array | None:
         return None
 
 
-def _ends(image: Array) -> F64:
+def ends_of(image: Array) -> F64:
     """(2,) the darkest and the brightest level of a deep image that are shown; NaN without any.
     Infinity, as some write it where nothing is known, is no level."""
     few = image[::4, ::4].astype(np.float64)
@@ -587,3 +578,18 @@ def black_and_white(ends: Iterable[F64]) -> tuple[float, float]:
     low, high = float(found[:, 0].min()), float(found[:, 1].max())
     more = WIDER * max(high - low, 1e-3, 1e-6 * abs(low))
     return low - more, high + more
+
+
+def is_photo(image: Array, low_high: tuple[float, float]) -> bool:
+    """Whether a deep image uses so many levels that all are shown."""
+    return image.dtype == np.uint16 and low_high[1] - low_high[0] > WIDE
+
+
+def levels(image: Array, low_high: tuple[float, float]) -> U8:
+    """A deep image in 8 bits: of all levels, or of those between black and white."""
+    if is_photo(image, low_high):
+        return np.asarray(image >> 8, np.uint8)
+    low, high = low_high
+    with np.errstate(over="ignore", invalid="ignore"):  # foreign floats may be any
+        share = (image.astype(np.float32) - low) * (255.0 / (high - low))
+    return np.asarray(np.nan_to_num(share).clip(0.0, 255.0), np.uint8)

@@ -7,7 +7,7 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -48,12 +48,14 @@ def stereo(
 
     Surface hidden from the right image takes the disparity of the surface behind it; blank areas
     and surface outside the right image are unknown. --checked keeps only verified disparities,
-    as in flight. Rows that lie apart, by a calibration a little off, are brought together.
+    as in flight. Rows that lie apart, by a calibration a little off, are brought together; where
+    one image is blurred, the other is blurred as much.
     """
     from recon.calibration.row_alignment import rows_aligned, rows_apart
+    from recon.image_quality import blur_apart, blurred
     from service.compute.backend_choice import choose_backend, load_learned_model
 
-    gray_left, gray_right = read_gray(left), read_gray(right)
+    gray_left, gray_right = read_pair(left, right)
     if gray_left.shape != gray_right.shape:
         raise InputError(
             f"{left} is {_size(gray_left)} but {right} is {_size(gray_right)}: "
@@ -67,6 +69,11 @@ def stereo(
     apart = rows_apart(gray_left, gray_right, (min_disparity, min_disparity + labels))
     if apart is not None:
         gray_right = rows_aligned(gray_right, apart)
+    blur_px = blur_apart(gray_left, gray_right)
+    if blur_px > 0.0:
+        gray_left = blurred(gray_left, blur_px)
+    elif blur_px < 0.0:
+        gray_right = blurred(gray_right, -blur_px)
     start = time.perf_counter()
     with refusing("stereo"):
         found = chosen.belief_propagation(gray_left, gray_right, labels, config)
@@ -77,9 +84,12 @@ def stereo(
     off_px = 0.0 if apart is None else float(apart @ middle)
     if as_json:
         report = {"out": str(out), "known_share": known, "backend": chosen.name, "rows_px": off_px}
-        print(json.dumps(report | {"seconds": seconds, "size_px": gray_left.shape[::-1]}))
+        report |= {"blur_px": blur_px, "seconds": seconds, "size_px": gray_left.shape[::-1]}
+        print(json.dumps(report))
     else:
         said = "" if apart is None else f", rows {off_px:.1f} px apart: aligned"
+        if blur_px:
+            said += f", {'left' if blur_px > 0 else 'right'} image sharper: blurred like the other"
         print(f"{out}: {_size(gray_left)}, {100 * known:.1f} % known, {chosen.name}{said}")
 
 
@@ -98,18 +108,33 @@ def matching_config(
     return replace(config, min_evidence=0.05, min_contrast=0.3, fill_occluded=True)
 
 
-def read_gray(path: Path) -> U8:
-    """A gray 8-bit image (h, w); InputError when there is none."""
+def read_pair(left: Path, right: Path) -> tuple[U8, U8]:
+    """Two gray 8-bit images, of those with more bits the levels that they use; InputError when
+    there is none."""
+    import numpy as np
+
+    images = read_gray(left), read_gray(right)
+    if all(image.dtype == np.uint8 for image in images):
+        return images
+    from service.cameras.images import black_and_white, ends_of, levels
+
+    low_high = black_and_white(ends_of(image) for image in images if image.dtype != np.uint8)
+    a, b = (image if image.dtype == np.uint8 else levels(image, low_high) for image in images)
+    return a, b
+
+
+def read_gray(path: Path) -> Any:
+    """A gray image (h, w) of as many bits as it has; InputError when there is none."""
     import cv2
     import numpy as np
 
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(data) else None
     if image is None:
         raise InputError(f"{path}: not an image that can be read; give PNG, JPEG or TIFF")
-    return np.asarray(image, np.uint8)
+    return image
 
 
 def check_output(path: Path, suffix: str) -> None:

@@ -94,6 +94,47 @@ def test_rows_that_lie_apart_are_brought_together(
     assert np.nanmean(off < 0.5) > 0.98 and np.isfinite(off).mean() > 0.95
 
 
+def found_by(tmp_path: Path, left: Any, right: Any) -> Any:
+    """Disparity by the command, of two images as they are stored in PNG."""
+    names = tmp_path / "a.png", tmp_path / "b.png"
+    for name, image in zip(names, (left, right), strict=True):
+        cv2.imwrite(str(name), image)
+    out = tmp_path / "found.npy"
+    assert run("stereo", *names, "--labels", 16, "--out", out, "--backend", "cpu") == 0
+    return np.load(out)
+
+
+def right_share(px: Any) -> float:
+    return float(np.mean(np.abs(px[8:-8, 24:-8] - 9.5) < 1.0))
+
+
+def test_the_sharper_of_two_images_is_blurred_like_the_other(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left, right = (cv2.imread(str(name), 0) for name in pair)
+    assert left is not None and right is not None
+    noise = np.random.default_rng(1).normal(0, 2, (2, *left.shape))
+    left, right = (np.clip(i + n, 0, 255) for i, n in zip((left, right), noise, strict=True))
+    soft = cv2.GaussianBlur(right, (0, 0), 2.5).astype(np.uint8)
+    sharp = left.astype(np.uint8), right.astype(np.uint8)
+    assert right_share(found_by(tmp_path, *sharp)) > 0.98
+    assert "blurred" not in capsys.readouterr().out
+    assert right_share(found_by(tmp_path, sharp[0], soft)) > 0.95
+    assert "left image sharper: blurred like the other" in capsys.readouterr().out
+
+
+def test_images_of_ten_bits_are_matched_like_those_of_eight(
+    pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Stored in 16 bits, as many cameras do."""
+    deep = []
+    for name in pair:
+        image = cv2.imread(str(name), 0)
+        assert image is not None
+        deep.append(image.astype(np.uint16) + 400)  # of 1023 levels
+    assert right_share(found_by(tmp_path, *deep)) > 0.98
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
