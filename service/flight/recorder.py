@@ -288,6 +288,7 @@ class Recorder:
             for event in events
             if isinstance(event, PosesChanged)
             for seq, pose in event.poses.items()
+            if seq in self._first_scale  # a full disk may have refused the keyframe
         ]
         if reposes:
             self.store.add_reposes(reposes)

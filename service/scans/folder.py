@@ -46,7 +46,7 @@ from service.scans.fused_cloud import (
 from service.scans.main_piece import in_words, main_poses, main_seqs, pieces_apart, stretches_apart
 from service.scans.report import maps_of, report_html
 from service.scans.trust import SharedSigma, scale_sigma, shared_sigma, slope_deg, trust_of
-from service.scans.writing import SUMMARY, write_whole, writing
+from service.scans.writing import SUMMARY, final, write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
 
@@ -313,7 +313,8 @@ class Failures:
             self.first = self.first or as_said
             self.why.setdefault(name, why[:LONGEST_REASON])
             level = self._level if known else logging.ERROR
-            log.log(level, "%s is not written: %s", self._folder / name, why, exc_info=not known)
+            path = final(self._folder / name)
+            log.log(level, "%s is not written: %s", path, why, exc_info=not known)
 
 
 def middle_stages(folder: Path, store: ScanStore) -> U8 | None:

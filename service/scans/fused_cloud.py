@@ -276,9 +276,10 @@ def write_laz(
     """Write clouds, at least one, to ``path``, in UTM with AMSL heights when there is a frame.
 
     They are in ENU metres; ``shared`` is of their points. RGB are 16 bits as the format requires
-    (8-bit value times 257).
+    (8-bit value times 257). Raises OSError when the disk is full.
     """
     import laspy
+    from lazrs import LazrsError
 
     rest = iter(parts)
     start = next(rest)
@@ -286,16 +287,19 @@ def write_laz(
         placed(_cut(start[0], slice(0, 1)), frame), frame, started_unix_ns, vertical
     )
     kind: dict[str, Any] = {"do_compress": laz, "closefd": False}
-    with open(path, "wb") as file, laspy.open(file, "w", header=header, **kind) as out:
-        for cloud, xyz_m, classes in chain([start], rest):
-            for at in range(0, len(cloud), CHUNK_POINTS):
-                cut = slice(at, at + CHUNK_POINTS)
-                part = _cut(cloud, cut)
-                places = placed(part, frame) if xyz_m is None else xyz_m[cut]
-                record = point_record(header, places, part, shared)
-                if classes is not None:
-                    record["classification"] = classes[cut]
-                out.write_points(record)
+    try:
+        with open(path, "wb") as file, laspy.open(file, "w", header=header, **kind) as out:
+            for cloud, xyz_m, classes in chain([start], rest):
+                for at in range(0, len(cloud), CHUNK_POINTS):
+                    cut = slice(at, at + CHUNK_POINTS)
+                    part = _cut(cloud, cut)
+                    places = placed(part, frame) if xyz_m is None else xyz_m[cut]
+                    record = point_record(header, places, part, shared)
+                    if classes is not None:
+                        record["classification"] = classes[cut]
+                    out.write_points(record)
+    except LazrsError as error:  # its compressor's, of any failure to write
+        raise OSError(str(error)) from error
 
 
 def _cut(cloud: PointCloud, cut: slice) -> PointCloud:

@@ -16,6 +16,7 @@ from pathlib import Path
 from service.errors import InputError, OutsideError, outside
 
 SUMMARY = "scan.json"
+PART = re.compile(r"/\.[^/]+\.[0-9]+-[0-9]+\.part(?=/)")
 
 
 @contextmanager
@@ -65,7 +66,7 @@ def filling_folder(path: Path) -> Iterator[Path]:
     nothing of it stays. A disk failure becomes an OutsideError."""
     is_new = not path.exists()
     try:
-        with _beside(path / "new") as part:
+        with _beside(path / "new", path) as part:
             part.mkdir()
             yield part
             for one in sorted(part.iterdir(), key=lambda one: one.is_file()):
@@ -96,17 +97,23 @@ def existing(folder: Path) -> Path:
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """The temporary path, after those of processes that are gone were removed."""
+def _beside(path: Path, named: Path | None = None) -> Iterator[Path]:
+    """The temporary path, after those of processes that are gone were removed; errors are of
+    ``named``, else of ``path``."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
-        with outside(f"cannot write {path}", "check the disk and its rights"):
+        with outside(f"cannot write {final(named or path)}", "check the disk and its rights"):
             path.parent.mkdir(parents=True, exist_ok=True)
             _remove_abandoned(path)
             yield part
     finally:
         with suppress(OSError):  # a disk that cannot be written cannot be cleaned either
             _remove(part)
+
+
+def final(path: Path) -> Path:
+    """Where ``path`` will lie, once the temporary folder that holds it is renamed."""
+    return Path(PART.sub("", str(path)))
 
 
 def _remove_abandoned(path: Path) -> None:

@@ -150,7 +150,7 @@ MANIFEST = "manifest.json"
 def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """MAPS into the folder ``out``; ``manifest.json`` lists files, sizes, SHA-256 and failures.
 
-    Raises the first error when none is written.
+    Raises the first error when none is written, and the disk's after those that are.
     """
     failures = Failures(out, logging.WARNING)
     with filling_folder(out) as part:
@@ -167,6 +167,9 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
             "failed": failures.why,
         }
         write_whole(part / MANIFEST, json.dumps(document, indent=1) + "\n")
+    full = failures.of_the_disk
+    if full is not None and isinstance(full.__cause__, OSError):  # not a missing package
+        raise full
 
 
 def write_kinds(

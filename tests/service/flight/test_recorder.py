@@ -26,6 +26,7 @@ from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
 from service.cameras.source import CameraFrame
+from service.errors import OutsideError
 from service.flight.recorder import REPLAYED, Recorder
 from service.scans.drawing import debug_path, load_debug
 from service.stream.codec import IMAGE_SHARE
@@ -204,6 +205,25 @@ def test_corrections_of_a_keyframe_are_numbered_and_grow_from_its_first_scale(
             recorder.write([PosesChanged({7: replace(one.pose, scale=scale)}), posed(8)])
         found = [store.repose(7, below) for below in (2, 3)]
     assert [(r.revision, r.scale) for r in found if r is not None] == [(1, 1.5), (2, 2.0)]
+
+
+class FullStore(ScanStore):
+    """Its disk is full for keyframes."""
+
+    def add_keyframe(self, *_: object) -> int:
+        raise OutsideError("the disk is full")
+
+
+def test_corrections_of_a_keyframe_that_a_full_disk_refused_are_left_out(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with FullStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, 0.1)
+        one = house.keyframe(7, 0.0)
+        with pytest.raises(OutsideError):
+            recorder.write([KeyframeReady(one), posed(7)])
+        recorder.write([PosesChanged({7: one.pose}), posed(8)])  # as at the end of the scan
+        assert store.repose(7, 2) is None
 
 
 def test_a_first_depth_is_offered_and_neither_stored_nor_counted(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import resource
 import sqlite3
 import struct
 import zipfile
@@ -21,7 +22,7 @@ from house_flight import HillsideFlight
 from spied import spied
 
 from recon.types import F64, Keyframe
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.offline.exports.report import made_maps
 from service.offline.exports.view import ExportOptions, ScanView, export
@@ -51,6 +52,21 @@ def enu_of(house: HouseFlight, utm: F64) -> F64:
 def from_wall(enu: F64) -> F64:
     """Metres outside (negative: inside) the house's walls."""
     return np.asarray(np.maximum(np.abs(enu[:, 0] - 10) - 6.0, np.abs(enu[:, 1] - 2) - 4.0))
+
+
+def test_all_maps_on_a_full_disk_are_those_that_fit_and_a_failure(
+    maps: Path, tmp_path: Path
+) -> None:
+    """No file may become larger than 100 kB, which ends as a full disk does."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with ScanView(maps.parent) as scan, pytest.raises(OutsideError, match="check the disk"):
+            export(scan, "all", tmp_path / "out", ExportOptions(cell_m=0.25))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert "ortho" in manifest["failed"] and manifest["files"]
 
 
 def test_the_manifest_lists_every_file_as_it_is(maps: Path) -> None:

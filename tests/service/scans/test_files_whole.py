@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import errno
 import os
+import re
+import resource
 import stat
 import subprocess
 import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from recon.types import PointCloud
 from service.errors import OutsideError
-from service.scans.writing import write_whole, writing, writing_folder
+from service.scans.fused_cloud import write_laz
+from service.scans.writing import filling_folder, write_whole, writing, writing_folder
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
@@ -100,3 +105,31 @@ def test_a_file_system_that_cannot_sync_folders_takes_files(
     with pytest.raises(OutsideError, match="Input/output"):
         write_whole(tmp_path / "a", "other")
     assert (tmp_path / "a").read_text() == "whole"
+
+
+def test_a_failure_names_the_file_as_it_will_be_called(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutsideError, match=re.escape(f"cannot write {tmp_path}/a/b.txt (")),
+        filling_folder(tmp_path / "a") as part,
+    ):
+        (part / "b.txt").mkdir()  # a folder where the file should go
+        write_whole(part / "b.txt", "whole")
+    with (
+        pytest.raises(OutsideError, match=re.escape(f"cannot write {tmp_path}/a (")),
+        filling_folder(tmp_path / "a"),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_is_an_error_of_the_disk_to_a_compressed_cloud(tmp_path: Path) -> None:
+    """No file may become larger than 30 kB: the compressor itself fails."""
+    many = np.random.default_rng(0).normal(0, 50, (20_000, 3)).astype(np.float32)
+    ones = np.ones(many.shape, np.uint8)
+    cloud = PointCloud(many, ones, many[:, 0], ones[:, 0])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, limits[1]))
+    try:
+        with pytest.raises(OSError):
+            write_laz(tmp_path / "cloud.laz", [(cloud, None, None)], None, 0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
