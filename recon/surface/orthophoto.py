@@ -2,9 +2,10 @@
 
 Views that a higher part of the surface hides, or nearly, are left out. The views' exposures are
 levelled, as a whole and from part to part of an image, and then those whose colour differs from
-most others left out (:func:`recon.surface.texture_views.consistent`). Neighbouring views blend
-across one cell of the surface model. An object is shown by one view as far as that sees it, so that
-seams run around buildings.
+most others left out (:func:`recon.surface.texture_views.consistent`). Neighbours show one view
+where that costs little resolution. What differs between views passes from one to the other around
+a seam; details do so within a cell of the surface model. An object is shown by one view as far as
+that sees it, so that seams run around buildings.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from recon.parallel import parallel_for
 from recon.surface.raster import Grid, Raster, highest_lowest
 from recon.surface.texture_atlas import Images, add_view, images_of, sample
 from recon.surface.texture_views import TextureView, TriangleViews, consistent, insert
-from recon.surface.texturing import faded_steps, levels
+from recon.surface.texturing import choose, faded_steps, levels
 from recon.types import F32, F64, I32, U8, Bool
 
 CLEAR_M = 0.3
@@ -40,6 +41,13 @@ EDGE_CELLS = 1.2
 """Sigma over which the outlines of what stands above its surroundings are smoothed."""
 
 EDGE_PX = 1.0
+ROUNDS = 4
+"""Of neighbours that agree on a view; more take longer and save few seams."""
+
+DETAIL_CELLS, FADE_CELLS = 1.5, 10.0
+"""Sigma of the two bands in which views pass into each other, and of the way from one to the other:
+poses and heights are good to less than the first."""
+
 STEPS = 17
 """Calls of ``progress`` in all."""
 
@@ -73,9 +81,10 @@ def orthophoto(
     gains, places = levels(found, len(views)), terrain.places_m.reshape(-1, 3)
     fields, found = faded_steps(places, np.ones(len(places)), views, found, gains)
     found = consistent(found)
-    label = found.view[:, 0]
+    label = chosen_views(found, terrain.raster.grid.shape)
     if terrain.objects is not None:
-        label = one_view_each(found, terrain.objects.ravel())
+        label = one_view_each(found, terrain.objects.ravel(), label)
+    fade = faded_seams(found, label, terrain.raster.grid.shape)
     label = label.reshape(terrain.raster.grid.shape)
     rgb = np.zeros((*grid.shape, 3), np.uint8)
     known = np.zeros(grid.shape, np.bool_)
@@ -88,7 +97,7 @@ def orthophoto(
     parallel_for(
         _paint, len(rgb), np.ascontiguousarray(terrain.places_m), _axes(terrain.places_m),
         terrain.raster.height_m, terrain.raster.rgb, np.ascontiguousarray(label),
-        images_of(views, gains, fields), to_cell, rgb, known,
+        fade, images_of(views, gains, fields), to_cell, rgb, known,
     )  # fmt: skip
     return rgb, known
 
@@ -118,10 +127,61 @@ def _sightings(
     return out
 
 
-def one_view_each(found: TriangleViews, objects: I32) -> I32:
-    """(N,) the view of each cell, of the cells of one object (N,) as far as possible the same: no
-    seam then runs across a roof."""
-    label: I32 = found.view[:, 0].copy()
+def chosen_views(found: TriangleViews, shape: tuple[int, int]) -> I32:
+    """(N,) the view of each cell of a raster of this shape, the same for neighbours where that
+    costs little resolution; -1 where none sees it."""
+    seen = np.flatnonzero(found.view[:, 0] >= 0)
+    number = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
+    inner = number[1:-1, 1:-1].reshape(-1)
+    inner[seen] = np.arange(len(seen))
+    number[1:-1, 1:-1] = inner.reshape(shape)
+    around = number[:-2, 1:-1], number[2:, 1:-1], number[1:-1, :-2], number[1:-1, 2:]
+    neighbours = np.column_stack([one.ravel()[seen] for one in around])
+    some = TriangleViews(found.view[seen], found.px_per_m[seen], found.bgr[seen])
+    label = np.full(len(found.view), -1, np.int32)
+    label[seen] = some.view[np.arange(len(seen)), choose(some, neighbours, ROUNDS)]
+    return label
+
+
+def faded_seams(found: TriangleViews, label: I32, shape: tuple[int, int]) -> F32:
+    """(rows, cols, 3) what is added to the colour (BGR) of each cell's view, ``label`` (N,), so
+    that views pass into each other: what differs over DETAIL_CELLS, within FADE_CELLS of a seam.
+
+    Two bands as of Burt and Adelson 1983 (doi:10.1145/245.247), of the differences between views,
+    whose fine band stays that of one view.
+    """
+    is_seen = found.view >= 0
+    mean = (found.bgr * is_seen[..., None]).sum(axis=1) / np.maximum(is_seen.sum(1), 1)[:, None]
+    total, weight = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 1), np.float32)
+    own = np.zeros((*shape, 3), np.float32)
+    for number, cell, slot in found.by_view():
+        r, c = np.divmod(cell, shape[1])
+        box = slice(r.min(), r.max() + 1), slice(c.min(), c.max() + 1)
+        r, c = r - box[0].start, c - box[1].start
+        sees = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start, 1), np.float32)
+        off, shows = np.zeros((*sees.shape[:2], 3), np.float32), np.zeros_like(sees)
+        sees[r, c], off[r, c] = 1.0, found.bgr[cell, slot] - mean[cell]
+        shows[r, c, 0] = label[cell] == number
+        coarse = _smooth(off, DETAIL_CELLS) / np.maximum(_smooth(sees, DETAIL_CELLS), 1e-6)
+        inside = np.maximum(2.0 * _smooth(sees, FADE_CELLS) - 1.0, 0.0)  # not to the view's edge
+        share = sees * (_smooth(shows, FADE_CELLS) * inside + 1e-3 * shows)
+        total[box] += share * coarse
+        weight[box] += share
+        own[box] += shows * coarse
+    return np.asarray(
+        np.where(weight > 0.0, total / np.maximum(weight, 1e-9) - own, 0.0), np.float32
+    )
+
+
+def _smooth(image: F32, sigma: float) -> F32:
+    smooth = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(smooth.reshape(image.shape), np.float32)
+
+
+def one_view_each(found: TriangleViews, objects: I32, label: I32) -> I32:
+    """(N,) the view of each cell, its ``label`` (N,), but of the cells of one object (N,) as far as
+    possible the same: no seam then runs across a roof."""
+    label = label.copy()
     cells = np.flatnonzero(objects)
     views, owner = found.view[cells], objects[cells].astype(np.int64)
     is_seen = views >= 0
@@ -203,7 +263,7 @@ def _is_hidden(
 @njit(cache=True, nogil=True)
 def _paint(
     begin: int, end: int, places: F64, axes: F64, height: F32, fallback: U8, label: I32,
-    images: Images, to_cell: tuple[float, float, float], rgb: U8, known: Bool,
+    fade: F32, images: Images, to_cell: tuple[float, float, float], rgb: U8, known: Bool,
 ) -> None:  # fmt: skip
     """Fill rows of ``rgb`` and ``known``; their cells are the model's by offset and scale."""
     rows, cols = height.shape
@@ -222,7 +282,7 @@ def _paint(
                 continue
             known[i, j] = True
             _place(places, axes, r, c, near, a, b, share, place)
-            total = _mix(place, label, r, c, share, images, colour, mixed)
+            total = _mix(place, label, fade, r, c, share, images, colour, mixed)
             for k in range(3):
                 value = float(fallback[r + near // 2, c + near % 2, k])
                 if total > 1e-3:
@@ -308,8 +368,9 @@ def _place(
 
 @njit(cache=True, nogil=True)
 def _mix(
-    place: F64, label: I32, r: int, c: int, share: F64, images: Images, colour: F64, mixed: F64
-) -> float:
+    place: F64, label: I32, fade: F32, r: int, c: int, share: F64, images: Images, colour: F64,
+    mixed: F64,
+) -> float:  # fmt: skip
     """Mean colour (times its weight) of a place in the views of four cells; the weight."""
     mixed[:] = 0.0
     total = 0.0
@@ -324,4 +385,7 @@ def _mix(
         if view < 0 or is_repeated or weight < 1e-3:
             continue
         total += add_view(images, view, place[0], place[1], place[2], weight, colour, mixed)
+    for n in range(4):
+        for k in range(3):
+            mixed[k] += total * share[n] * fade[r + n // 2, c + n % 2, k]
     return total

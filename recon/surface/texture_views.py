@@ -6,7 +6,7 @@ Waechter, Moehrle and Goesele 2014 (doi:10.1007/978-3-319-10602-1_54, sections 3
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -61,6 +61,14 @@ class TriangleViews:
             np.zeros((count, CANDIDATES), np.float32),
             np.zeros((count, CANDIDATES, 3), np.float32),
         )
+
+    def by_view(self) -> Iterator[tuple[int, I64, I64]]:
+        """Each view that sees any, the triangles that it sees, rising, and its slot of each."""
+        views = self.view.ravel()
+        order = np.argsort(views, kind="stable")[int((views < 0).sum()) :]
+        for part in np.split(order, np.flatnonzero(np.diff(views[order])) + 1):
+            if len(part):
+                yield int(views[part[0]]), *np.divmod(part, self.view.shape[1])
 
 
 def look(

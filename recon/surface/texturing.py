@@ -144,28 +144,29 @@ SETTLED = 1e-3
 """A triangle whose messages change by less has no more to say until its neighbours do."""
 
 
-def choose(found: TriangleViews, neighbours: I32) -> I32:
-    """(F,) the slot of ``found`` chosen for each triangle; -1 where no view sees it."""
+def choose(found: TriangleViews, neighbours: I32, iterations: int = ITERATIONS) -> I32:
+    """(F,) the slot of ``found`` chosen for each triangle or cell, next to ``neighbours`` (F, E;
+    -1: none); -1 where no view sees it."""
     best = np.maximum(found.px_per_m[:, :1], 1e-9)
     cost = np.where(found.view >= 0, 1.0 - found.px_per_m / best, np.float32(1e6))
     return np.asarray(
-        _propagated(found.view, cost.astype(np.float32), neighbours, PENALTY, ITERATIONS)
+        _propagated(found.view, cost.astype(np.float32), neighbours, PENALTY, iterations)
     )
 
 
 @njit(cache=True, nogil=True)
 def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iterations: int) -> I32:
     """Slots after belief propagation and iterated conditional modes."""
-    faces, slots = view.shape
-    back = np.full((faces, 3), -1, np.int32)  # which of the neighbour's edges leads here
+    (faces, slots), edges = view.shape, neighbours.shape[1]
+    back = np.full((faces, edges), -1, np.int32)  # which of the neighbour's edges leads here
     for f in range(faces):
-        for e in range(3):
+        for e in range(edges):
             g = neighbours[f, e]
             if g >= 0:
-                for d in range(3):
+                for d in range(edges):
                     if neighbours[g, d] == f:
                         back[f, e] = d
-    message = np.zeros((faces, 3, slots), np.float32)  # to (f) over its edge e
+    message = np.zeros((faces, edges, slots), np.float32)  # to (f) over its edge e
     belief = np.empty(slots, np.float32)
     is_due = view[:, 0] >= 0
     for iteration in range(iterations):
@@ -175,14 +176,14 @@ def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iteration
             if not is_due[f]:
                 continue
             is_due[f] = False
-            for e in range(3):
+            for e in range(edges):
                 g = neighbours[f, e]
                 if g < 0 or view[g, 0] < 0:
                     continue
                 least = np.float32(np.inf)
                 for k in range(slots):
                     belief[k] = cost[f, k]
-                    for d in range(3):
+                    for d in range(edges):
                         if d != e:
                             belief[k] += message[f, d, k]
                     if view[f, k] >= 0 and belief[k] < least:
@@ -202,7 +203,9 @@ def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iteration
     for f in range(faces):
         best = np.float32(np.inf)
         for k in range(slots):
-            total = cost[f, k] + message[f, 0, k] + message[f, 1, k] + message[f, 2, k]
+            total = cost[f, k]
+            for e in range(edges):
+                total += message[f, e, k]
             if view[f, k] >= 0 and total < best:
                 best, out[f] = total, k
     _settle(view, cost, neighbours, penalty, out)
@@ -221,7 +224,7 @@ def _settle(view: I32, cost: F32, neighbours: I32, penalty: float, slot: I32) ->
                 if view[f, k] < 0:
                     break
                 total = float(cost[f, k])
-                for e in range(3):
+                for e in range(neighbours.shape[1]):
                     g = neighbours[f, e]
                     if g >= 0 and slot[g] >= 0 and view[g, slot[g]] != view[f, k]:
                         total += penalty
@@ -377,11 +380,14 @@ def faded_steps(
     is_seen = found.view >= 0  # views that were dropped leave their colours behind
     total = (levelled(found, gains).bgr * is_seen[..., None]).sum(axis=1)
     mean = total / np.maximum(is_seen.sum(axis=1), 1)[:, None]
-    bgr, fields = found.bgr.copy(), []
-    for number, view in enumerate(views):
-        f, slot = np.nonzero(found.view == number)
+    bgr, fields = found.bgr.copy(), list[F32]()
+    for view in views:
         h, w = view.bgra.shape[:2]
         rows, cols = (max(2, round(FIELD_CELLS * side / max(h, w))) for side in (h, w))
+        fields.append(np.ones((rows, cols, 4), np.float32))
+    for number, f, slot in found.by_view():
+        view, field = views[number], fields[number]
+        (h, w), (rows, cols) = view.bgra.shape[:2], field.shape[:2]
         place = (projected(view, middle_m[f]) + 0.5) * [cols / w, rows / h]
         col, row = np.clip(place.astype(np.int64), 0, [cols - 1, rows - 1]).T
         weight = area[f] * found.px_per_m[f, slot] ** 2
@@ -393,11 +399,9 @@ def faded_steps(
         smooth = gaussian_filter(np.stack(sums, 2), (FIELD_SIGMA, FIELD_SIGMA, 0.0))
         wanted, own = smooth[..., :3], smooth[..., 3:]
         few = 1e-3 * max(float(own.max()), 1e-3)
-        field = np.ones((rows, cols, 4), np.float32)
         factor = (wanted + few) / (own + few)
         field[..., :3] = np.clip(factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
         bgr[f, slot] *= field[row, col, :3]
-        fields.append(field)
     return fields, levelled(replace(found, bgr=bgr), gains)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.surface.orthophoto import Terrain, one_view_each, orthophoto
+from recon.surface.orthophoto import Terrain, chosen_views, one_view_each, orthophoto
 from recon.surface.raster import Grid, Raster, round_cell
 from recon.surface.texture_views import TextureView, TriangleViews
 from recon.types import F64, U8, Bool
@@ -148,8 +148,41 @@ def test_no_seam_runs_across_an_object_that_one_view_sees() -> None:
         view.astype(np.int32), px.astype(np.float32), np.zeros((6, 3, 3), np.float32)
     )
     objects = np.array([3, 3, 3, 3, 3, 0], np.int32)
-    assert one_view_each(found, objects).tolist() == [1, 1, 1, 1, 2, 0]  # 34 px against 33
-    assert one_view_each(found, 0 * objects).tolist() == view[:, 0].tolist()
+    label = found.view[:, 0]
+    assert one_view_each(found, objects, label).tolist() == [1, 1, 1, 1, 2, 0]  # 34 px against 33
+    assert one_view_each(found, 0 * objects, label).tolist() == label.tolist()
+
+
+def test_neighbours_show_one_view_where_that_costs_little_resolution() -> None:
+    rng = np.random.default_rng(1)
+    shape = 12, 20
+    px = 10.0 + 0.2 * rng.standard_normal((*shape, 2))
+    px[:, 10:, 1] += 5.0  # the second view is nearer there
+    px[3, 4] = 0.0, 9.0
+    best = np.argsort(-px, axis=2)
+    view = np.where(np.take_along_axis(px, best, 2) > 0.0, best, -1).reshape(-1, 2)
+    view[7] = -1
+    px = np.take_along_axis(px, best, 2).reshape(-1, 2)
+    found = TriangleViews(
+        view.astype(np.int32), px.astype(np.float32), np.zeros((len(view), 2, 3), np.float32)
+    )
+    label = chosen_views(found, shape).reshape(shape)
+    assert label[0, 7] == -1 and label[3, 4] == 1
+    assert (label[:, 10:] == 1).all()
+    west = label[:, :9]
+    assert np.unique(west[west >= 0], return_counts=True)[1].max() > 0.9 * west.size
+
+
+def test_what_shines_in_one_view_alone_has_no_edge_at_the_seam() -> None:
+    """As a wet road does. It is narrower than the field that levels an image's parts."""
+    views = [view(x, 12.0) for x in (8.0, 16.0)]
+    views[0].bgra[60:84, :, :3] += 40  # a road from west to east, 2 m wide, at 18 to 20 m north
+    found, _ = orthophoto(terrain(views), views, FINE)
+    road = found[45:55, 5:235].astype(float).mean(axis=(0, 2))
+    rest = true_map()[45:55, 5:235].astype(float).mean(axis=(0, 2))
+    shine = np.convolve(road - rest, np.ones(5) / 5, mode="valid")
+    assert shine.max() - shine.min() > 15.0
+    assert np.abs(shine[10:] - shine[:-10]).max() < 0.4 * (shine.max() - shine.min())
 
 
 def test_a_slanted_edge_runs_across_cells_not_around_them() -> None:
