@@ -123,7 +123,7 @@ def test_what_nobody_asked_for_waits_for_all_others(tmp_path: Path) -> None:
 
 
 def test_what_is_asked_for_begins_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also while what nobody asked for waits to be looked at again."""
+    """Also while one that was not asked for waits to be looked at again."""
     monkeypatch.setattr("service.ground.state.LOOK_S", 60.0)
     looked = threading.Event()
 
