@@ -61,38 +61,52 @@ def sharpness(gray: U8) -> float:
     return fine / coarse if coarse > 0 else float("nan")
 
 
-FINEST_PX, MIN_APART_PX, MAX_APART_PX = 0.3, 0.55, 6.0
-"""Sigmas of a blur: the narrowest that changes an image, that of which two images of one scene may
-differ, and the widest that is sought."""
+MIN_APART_PX, MAX_APART_PX = 0.55, 4.0
+"""Sigma of a blur in which two images of one scene may differ, and of the widest sought."""
+
+NOISY, NOISE_PX = 18.0, 0.8
+"""Fine detail above which an image is mostly noise: the sharpest photos have 14, and 20 or more
+with noise of 10 gray levels. And the sigma of the blur that suppresses it."""
 
 
-def blur_apart(left: U8, right: U8) -> float:
-    """Sigma in px of the blur that makes the sharper of two gray images (h, w) of one scene as
-    blurred as the other; negative where ``right`` is the sharper one, 0 where both are as sharp."""
+def alike(left: U8, right: U8) -> tuple[U8, U8, float, float]:
+    """Two gray images (h, w) of one scene, equally sharp and with little noise, and the sigmas in
+    px of the blur that each of them got for it; 0 where an image is as it was."""
     detail = _fine_detail(left), _fine_detail(right)
-    if not np.isfinite(detail).all():
-        return 0.0
-    sharper, least = (left, detail[1]) if detail[0] > detail[1] else (right, detail[0])
-    low, high = FINEST_PX, MAX_APART_PX
-    while high - low > 0.05:
-        middle = 0.5 * (low + high)
-        is_sharper = _fine_detail(blurred(sharper, middle)) > least
-        low, high = (middle, high) if is_sharper else (low, middle)
-    if low < MIN_APART_PX:
-        return 0.0
-    return low if sharper is left else -low
+    if min(detail) > NOISY:
+        sigma = [NOISE_PX, NOISE_PX]
+    else:
+        sharper = int(detail[1] > detail[0])
+        sigma = [0.0, 0.0]
+        sigma[sharper] = _apart((left, right)[sharper], min(detail))
+    left, right = (
+        i if s == 0 else _blurred(i, s) for i, s in zip((left, right), sigma, strict=True)
+    )
+    return left, right, sigma[0], sigma[1]
 
 
-def blurred(gray: U8, sigma_px: float) -> U8:
-    """The image (h, w) blurred by a Gaussian."""
+def _apart(sharper: U8, detail: float) -> float:
+    """Sigma in px of the narrowest blur with which an image has no more than this fine detail; 0
+    where they are as sharp, or differ in more. Of the widest, rounded gray levels are all that is
+    left, as fine as noise."""
+    sigma = MIN_APART_PX
+    while _fine_detail(_blurred(sharper, sigma)) > detail:
+        sigma *= 1.1
+        if sigma > MAX_APART_PX:
+            return 0.0
+    return sigma if sigma > MIN_APART_PX else 0.0
+
+
+def _blurred(gray: U8, sigma_px: float) -> U8:
     return np.asarray(cv2.GaussianBlur(gray, (0, 0), sigma_px), np.uint8)
 
 
 def _fine_detail(gray: U8) -> float:
-    """Like :func:`sharpness`, at the image's own size: it falls with any blur."""
-    fine, coarse = (cv2.Laplacian(one, cv2.CV_16S) for one in (gray, blurred(gray, 2.0)))
-    rough = cv2.norm(coarse, cv2.NORM_L1)
-    return cv2.norm(fine, cv2.NORM_L1) / rough if rough > 0 else float("nan")
+    """Like :func:`sharpness`, at the image's own size: it falls with any blur. NaN without any."""
+    image = gray.astype(np.float32)
+    blurred = cv2.GaussianBlur(image, (0, 0), 2.0)
+    fine, coarse = (cv2.norm(cv2.Laplacian(i, cv2.CV_32F), cv2.NORM_L1) for i in (image, blurred))
+    return fine / coarse if coarse > 0 else float("nan")
 
 
 BLURRED_SHARE = 0.6  # of the median sharpness of the last images: less is blurred

@@ -48,11 +48,12 @@ def stereo(
 
     Surface hidden from the right image takes the disparity of the surface behind it; blank areas
     and surface outside the right image are unknown. --checked keeps only verified disparities,
-    as in flight. Rows that lie apart, by a calibration a little off, are brought together; where
-    one image is blurred, the other is blurred as much.
+    as in flight. Rows that lie apart, by a calibration a little off, are brought together;
+    where one image is blurred, the other is blurred as much, and a little are both where noise
+    hides what they show.
     """
     from recon.calibration.row_alignment import rows_aligned, rows_apart
-    from recon.image_quality import blur_apart, blurred
+    from recon.image_quality import alike
     from service.compute.backend_choice import choose_backend, load_learned_model
 
     gray_left, gray_right = read_pair(left, right)
@@ -69,11 +70,7 @@ def stereo(
     apart = rows_apart(gray_left, gray_right, (min_disparity, min_disparity + labels))
     if apart is not None:
         gray_right = rows_aligned(gray_right, apart)
-    blur_px = blur_apart(gray_left, gray_right)
-    if blur_px > 0.0:
-        gray_left = blurred(gray_left, blur_px)
-    elif blur_px < 0.0:
-        gray_right = blurred(gray_right, -blur_px)
+    gray_left, gray_right, *blurs_px = alike(gray_left, gray_right)
     start = time.perf_counter()
     with refusing("stereo"):
         found = chosen.belief_propagation(gray_left, gray_right, labels, config)
@@ -84,12 +81,14 @@ def stereo(
     off_px = 0.0 if apart is None else float(apart @ middle)
     if as_json:
         report = {"out": str(out), "known_share": known, "backend": chosen.name, "rows_px": off_px}
-        report |= {"blur_px": blur_px, "seconds": seconds, "size_px": gray_left.shape[::-1]}
+        report |= {"blurs_px": blurs_px, "seconds": seconds, "size_px": gray_left.shape[::-1]}
         print(json.dumps(report))
     else:
         said = "" if apart is None else f", rows {off_px:.1f} px apart: aligned"
-        if blur_px:
-            said += f", {'left' if blur_px > 0 else 'right'} image sharper: blurred like the other"
+        if all(blurs_px):
+            said += ", both images noisy: blurred"
+        elif any(blurs_px):
+            said += f", {'left' if blurs_px[0] else 'right'} image sharper: blurred like the other"
         print(f"{out}: {_size(gray_left)}, {100 * known:.1f} % known, {chosen.name}{said}")
 
 

@@ -123,6 +123,17 @@ def test_the_sharper_of_two_images_is_blurred_like_the_other(
     assert "left image sharper: blurred like the other" in capsys.readouterr().out
 
 
+def test_noise_is_suppressed_where_it_hides_the_scene(
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in a dark pair: of twelve levels, with noise of two."""
+    dim = [0.05 * np.asarray(cv2.imread(str(name), 0), np.float32) for name in pair]
+    noise = np.random.default_rng(1).normal(0, 2, (2, *dim[0].shape))
+    dark = [np.clip(i + n, 0, 255).astype(np.uint8) for i, n in zip(dim, noise, strict=True)]
+    assert right_share(found_by(tmp_path, *dark)) > 0.6
+    assert "both images noisy: blurred" in capsys.readouterr().out
+
+
 def test_images_of_ten_bits_are_matched_like_those_of_eight(
     pair: tuple[Path, Path], tmp_path: Path
 ) -> None:
