@@ -76,7 +76,7 @@ class Rig:
         self.vertical_datum = ""
         self.is_pressure_altitude = False
         self.is_stabilised = False  # the vehicle's attitude is not the camera's
-        self._is_altitude_stated = False
+        self._is_altitude_stated = self._is_altitude_known = False
         self._lever_body = np.array(
             [camera.lever_forward_m, camera.lever_right_m, camera.lever_down_m]
         )
@@ -94,6 +94,11 @@ class Rig:
         """True when there are positions, and none states the accuracy of its altitude."""
         return self.georeference != "none" and not self._is_altitude_stated
 
+    @property
+    def is_altitude_missing(self) -> bool:
+        """True when there are positions, and none has an altitude."""
+        return self.georeference != "none" and not self._is_altitude_known
+
     def prior(self, state: VehicleState | None, tag: GeoTag | None) -> PosePrior:
         """The prior of one frame from telemetry, otherwise from the image's own tag.
 
@@ -102,7 +107,9 @@ class Rig:
         """
         R, tilt, yaw = self._rotation(state, tag)
         fix = self._fix(state, tag)
-        self._is_altitude_stated |= fix is not None and fix.is_claimed
+        if fix is not None and fix.alt_amsl_m is not None:
+            self._is_altitude_known = True
+            self._is_altitude_stated |= fix.is_claimed
         position, sigma = self._position(fix)
         lever = self._lever(state)
         height = self._agl(state, tag, float(lever[2]))

@@ -339,8 +339,9 @@ class Scan:
 
     def _assumed(self) -> list[str]:
         """What was assumed in this scan: "lens", "distortion", "start" unless turns confirm it,
-        "view", "level", "height", "altitude", with "pressure" where air pressure gave it, and with
-        a narrow view "turn", as vision alone cannot separate it from distance."""
+        "view", "level", "height", "altitude", with "pressure" where air pressure gave it and
+        "no altitude" where nothing did, and with a narrow view "turn", as vision alone cannot
+        separate it from distance."""
         out = [w for w in self.inputs.assumed if w != "start" or not self.check.is_clock_sure]
         if self.attitudes == 0 or self.check.is_stabilised:
             out.append("view")
@@ -348,7 +349,9 @@ class Scan:
             out.append("level")
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
-        if self.rig.is_altitude_assumed:
+        if self.rig.is_altitude_missing:
+            out += ["altitude", "no altitude"]
+        elif self.rig.is_altitude_assumed:
             out += ["altitude", "pressure"] if self.rig.is_pressure_altitude else ["altitude"]
         if self.inputs.camera.K[0, 0] > MAX_FOCAL * max(self.inputs.camera.size_px):
             out.append("turn")

@@ -45,7 +45,14 @@ from service.scans.fused_cloud import (
 )
 from service.scans.main_piece import in_words, main_poses, main_seqs, pieces_apart, stretches_apart
 from service.scans.report import maps_of, report_html
-from service.scans.trust import SharedSigma, scale_sigma, shared_sigma, slope_deg, trust_of
+from service.scans.trust import (
+    SharedSigma,
+    lacks_altitude,
+    scale_sigma,
+    shared_sigma,
+    slope_deg,
+    trust_of,
+)
 from service.scans.writing import SUMMARY, final, write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
@@ -218,7 +225,7 @@ class _Files:
             "finished": store.finished,
             "origin": origin,
             "epsg": None if frame is None else frame.epsg,
-            "heights": track.heights_above(frame, track.flown_datum(header)),
+            "heights": track.heights_above(frame, track.flown_datum(header), lacks_altitude(store)),
             "georeference": header.georeference,
             "camera": header.camera,
             "configuration": public_configuration(header.configuration),

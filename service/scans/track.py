@@ -50,9 +50,9 @@ def flown_datum(header: ScanHeader) -> str | None:
     return header.vertical_datum
 
 
-def heights_above(frame: LocalFrame | None, datum: str | None) -> str:
+def heights_above(frame: LocalFrame | None, datum: str | None, lacks_altitude: bool) -> str:
     """What heights are above, in words."""
-    if frame is None:
+    if frame is None or lacks_altitude:
         return "metres above the scan's origin"
     return f"metres above {datum or 'mean sea level'}"
 

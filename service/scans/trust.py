@@ -36,6 +36,8 @@ it: 8.4 m for each hPa of the weather, whose sigma is about 8 hPa."""
 
 MAX_NUMBER = 1e12  # a larger figure in a summary is none: a peer's may be anything that JSON can be
 
+NO_ALTITUDE = "no altitude"  # of what is assumed in a scan
+
 BENDS = {"lens": 0.02, "distortion": 0.01}
 """Sigma of depth over depth by what is assumed of the lens: it bends surfaces by so much."""
 
@@ -153,7 +155,12 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         )
     if focal > MIN_LENS_SIGMA:
         limits.append(_uncertain(focal))
-    if "altitude" in assumed and georeference != BY_SURVEY:
+    if NO_ALTITUDE in assumed and georeference != BY_SURVEY:
+        limits.append(
+            "no position has an altitude: heights are above the scan's origin, not above sea "
+            "level; give control points"
+        )
+    elif "altitude" in assumed and georeference != BY_SURVEY:
         limits.append(
             "the altitudes are those of the air pressure in standard weather: all heights above "
             f"sea level err by {PRESSURE_SIGMA_M:.0f} m together (1 sigma); give control points"
@@ -315,6 +322,12 @@ class SharedSigma:
         by_depth = self._share * (self._up_m[at] - places_m[:, 2])
         whole_m = np.sqrt(own_m**2 + self._sigma_m[at] ** 2 + by_depth**2 + self._datum_m**2)
         return np.asarray(whole_m, np.float32)
+
+
+def lacks_altitude(store: ScanStore) -> bool:
+    """Whether nothing says how high above sea level the scan is."""
+    assumed = _assumed(store.summary or {})
+    return NO_ALTITUDE in assumed and store.header.georeference != BY_SURVEY
 
 
 def shared_sigma(store: ScanStore) -> SharedSigma | None:

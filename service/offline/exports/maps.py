@@ -26,7 +26,8 @@ from service.offline.exports.view import ExportOptions, ScanView, check, export
 from service.offline.tiles import union
 from service.scans.folder import Failures
 from service.scans.fused_cloud import Box
-from service.scans.track import flown_datum
+from service.scans.track import flown_datum, heights_above
+from service.scans.trust import lacks_altitude
 from service.scans.writing import filling_folder, write_whole, writing
 from service.version import software
 
@@ -225,8 +226,8 @@ HEIGHTS = (
 
 
 def _heights(scan: ScanView, options: ExportOptions) -> str:
-    if scan.frame is None:
-        return "metres above the scan's origin"
+    if scan.frame is None or lacks_altitude(scan.store):
+        return heights_above(None, None, True)
     datum = options.vertical_datum
     is_of_tags = datum == flown_datum(scan.store.header)
     says = "the images' tags say" if is_of_tags else "the operator says"

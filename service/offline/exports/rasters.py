@@ -38,6 +38,7 @@ from service.scans.coverage import coverage_of
 from service.scans.fused_cloud import Box
 from service.scans.main_piece import main_keyframes, main_seqs
 from service.scans.track import heights_above
+from service.scans.trust import lacks_altitude
 from service.scans.writing import writing
 
 NODATA_M = -9999.0
@@ -243,7 +244,7 @@ def mosaic(scan: ScanView, out: Path, grid: Grid, like: Layers) -> Iterator[Any]
         # GeoTIFF has no code for ellipsoidal heights on a map.
         coded = None if like.vertical == "ellipsoid" else like.vertical
         profile["crs"] = rasterio.crs.CRS.from_wkt(map_crs(scan.frame.epsg, coded).to_wkt())
-    heights = heights_above(scan.frame, like.vertical)
+    heights = heights_above(scan.frame, like.vertical, lacks_altitude(scan.store))
     with (
         writing(out) as part,
         tempfile.TemporaryDirectory(dir=out.parent) as folder,

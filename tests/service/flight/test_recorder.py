@@ -29,6 +29,7 @@ from service.cameras.source import CameraFrame
 from service.errors import OutsideError
 from service.flight.recorder import REPLAYED, Recorder
 from service.scans.drawing import debug_path, load_debug
+from service.scans.folder import write_deliverables
 from service.stream.codec import IMAGE_SHARE
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
@@ -285,6 +286,20 @@ def test_the_datum_of_a_logs_altitudes_is_the_scans(tmp_path: Path) -> None:
     header = scan.store.header
     scan.store.close()
     assert (header.vertical_datum, header.origin_alt_amsl_m) == ("ellipsoid", -23.0)
+
+
+def test_a_scan_whose_positions_have_no_altitude_says_so(tmp_path: Path) -> None:
+    """As subtitles of some drones: its heights would be called above sea level."""
+    history = VehicleHistory()
+    for k in range(3):
+        history.add(PositionSample(None, 53.36, 6.46, None, 50.0, None), k * 100_000_000)
+    scan = real_scan(tmp_path / "scan", history=history)
+    scan.feed(CameraFrame(np.zeros((90, 160, 3), np.uint8), 0, 0, None, "frame 0"))
+    assert "no altitude" in scan.close()["assumed"]
+    document = write_deliverables(tmp_path / "scan", scan.store)
+    scan.store.close()
+    assert document["georeference"] == "gnss"
+    assert document["heights"] == "metres above the scan's origin"
 
 
 @pytest.mark.parametrize("is_pressure", [False, True])

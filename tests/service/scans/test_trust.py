@@ -35,6 +35,8 @@ SURE: dict[str, Any] = {
         ({"assumed": ["altitude"]}, BY_SURVEY, "georeferenced", ""),
         ({"assumed": ["altitude", "pressure"]}, "exif", "georeferenced", "air pressure"),
         ({"assumed": ["altitude", "pressure"]}, BY_SURVEY, "georeferenced", ""),
+        ({"assumed": ["altitude", "no altitude"]}, "gnss", "georeferenced", "not above sea level"),
+        ({"assumed": ["altitude", "no altitude"]}, BY_SURVEY, "georeferenced", ""),
         ({"sigma_focal": 0.008}, "gnss", "georeferenced", ""),
         (
             {"sigma_focal": 0.04},
