@@ -402,5 +402,6 @@ class Scan:
         if frames and self.recorder.keyframes == false:
             top = self.mapper.refusals().most_common(2)
             why = "; ".join(f"{reason} ({n})" for reason, n in top) or "too few frames"
-            out.append(f"nothing was reconstructed: {why}")
+            few = f"{frames} image{'s' * (frames > 1)}, three that overlap are needed; "
+            out.append(f"nothing was reconstructed: {few if frames < 3 else ''}{why}")
         return out

@@ -436,6 +436,16 @@ def cue(number: int, text: str) -> str:
     return f"{number + 1}\n{start} --> {end}\n{text}\n\n"
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+def test_subtitles_that_another_tool_stored_again_are_read(tmp_path: Path, encoding: str) -> None:
+    text = "[latitude: 47.1] [longitude: 8.5] [rel_alt: 50.0 abs_alt: 500.0]"
+    path = tmp_path / "flight.srt"
+    mark = "\ufeff" if encoding == "utf-16-be" else ""
+    lines = "".join(cue(k, text) for k in range(3)).replace("\n", "\r\n")
+    path.write_bytes((mark + lines).encode(encoding))
+    assert load_telemetry(path).counts["positions"] == 3
+
+
 def test_subtitles_of_a_drone_without_a_position_give_its_height(tmp_path: Path) -> None:
     lost = "[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 30.000 abs_alt: 269.1]"
     found = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.000 abs_alt: 269.1]"

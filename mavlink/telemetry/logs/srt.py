@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -55,7 +56,9 @@ NAN = math.nan
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open("rb") as head:
+        encoding = "utf-16" if head.read(2) in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8"
+    with path.open(encoding=encoding, errors="replace") as file:
         return of_cues(path, _cues(file), config)
 
 

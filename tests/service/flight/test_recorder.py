@@ -302,6 +302,14 @@ def test_a_scan_whose_positions_have_no_altitude_says_so(tmp_path: Path) -> None
     assert document["heights"] == "metres above the scan's origin"
 
 
+def test_a_scan_of_one_image_says_how_many_are_needed(tmp_path: Path) -> None:
+    scan = real_scan(tmp_path / "scan")
+    scan.feed(CameraFrame(np.zeros((90, 160, 3), np.uint8), 0, 0, None, "frame 0"))
+    warnings = scan.close()["warnings"]
+    scan.store.close()
+    assert any("1 image, three that overlap are needed" in line for line in warnings)
+
+
 @pytest.mark.parametrize("is_pressure", [False, True])
 def test_a_scan_says_which_altitudes_are_those_of_air_pressure(
     tmp_path: Path, is_pressure: bool
