@@ -40,6 +40,7 @@ SHOWN, WIDER, LOOKED_AT = (0.5, 99.5), 0.5, 5
 that are shown; the share of those that is shown beyond them on each side; and how many images
 tell."""
 
+MAX_PER_S = 10  # stills that a drone takes in a second, at most
 WIDE = 1 << 15  # where more levels of 16 bits are shown than these it is a photo, and all are
 
 MAX_PAN_DEG = 30.0
@@ -386,18 +387,21 @@ class ImagesSource(CameraSource):
         tags = [t for _, t in tagged]
         offset_ns = clock_offset_ns(tags)
         unix = [utc_ns(t, offset_ns) for t in tags]
-        known = [t for t in unix if t is not None]
+        known = differing(unix)
         if interval_s is None and len(known) == len(tags):
             return _from_first(spread(known, tags)), min(known)
-        local = [t.local_ns for t in tags if t.local_ns is not None]
+        local = differing(t.local_ns for t in tags)
         if interval_s is None and len(local) == len(tags):
             self._warn("the images state no time zone: their local time is taken as UTC")
             return _from_first(spread(local, tags)), min(local)
         if interval_s is None:
             missing = sum(t.local_ns is None and t.name_unix_ns is None for t in tags)
             order, by = self._order(tagged)
+            lack = (
+                f"{missing} of {len(tags)} images have no time" if missing else "one time for all"
+            )
             self._warn(
-                f"{missing} of {len(tags)} images have no time; ordered by {by}, one per second "
+                f"{lack}; ordered by {by}, one per second "
                 "(images:DIR?interval_s=2 orders them by name and sets it)"
             )
             return [int(n) * SECOND_NS for n in np.argsort(order)], unix[order[0]]
@@ -530,6 +534,13 @@ def spread(times_ns: list[int], tags: list[Tags]) -> list[int]:
         out.append(time_ns + taken[time_ns] * step)
         taken[time_ns] += 1
     return out
+
+
+def differing(times_ns: Iterable[int | None]) -> list[int]:
+    """The times that are known; none where more stills state one than a camera takes in a second:
+    a tool wrote it."""
+    known = [t for t in times_ns if t is not None]
+    return [] if max(Counter(known).values(), default=0) > MAX_PER_S else known
 
 
 def _from_first(times_ns: list[int]) -> list[int]:
