@@ -6,27 +6,50 @@ import cv2
 import numpy as np
 
 from recon.tracking.sift_features import features, mutual
-from recon.types import F64, U8
+from recon.types import F64, U8, Bool
 
 MOST, WIDTH_PX = 3000, 1600  # features that are matched, and the width at which they are sought
 MAX_SHARE = 0.02  # of the height; rows further apart are another pair, or not rectified
 MIN_MATCHES, MIN_CONSENT = 60, 0.5  # that agree, and their share of those within reach
+RANGE_PERCENTILES = 2.0, 98.0
 GATE_SIGMAS, FLOOR_PX, ROUNDS = 3.0, 0.25, 8
 MIN_OFF_PX = 0.5  # rows that are less apart stay: matching bridges half a pixel
 
 
-def rows_apart(left: U8, right: U8, disparities: tuple[float, float]) -> F64 | None:
-    """(3,) a, b, c: what ``right`` (h, w) shows at (u, v) lies a + b u + c v px lower than in
-    ``left``, by features whose disparity is within ``disparities``. None where rows surely do not
-    differ, or too little agrees on how.
-    """
+def features_apart(left: U8, right: U8) -> tuple[F64, F64]:
+    """Features of two images (h, w) that match: (N, 2) px in ``right``, and how much farther right
+    and lower ``left`` shows them, (N, 2) px; those in about the same row."""
     a, b = (features(g, WIDTH_PX, MOST, are_strongest=True) for g in (left, right))
     rows_a, rows_b = mutual(a.descriptors, b.descriptors)
     there, apart = b.uv_px[rows_b], a.uv_px[rows_a] - b.uv_px[rows_b]
-    lower = -apart[:, 1]
-    near = (apart[:, 0] >= disparities[0] - 1) & (apart[:, 0] <= disparities[1] + 1)
-    near &= np.abs(lower) < MAX_SHARE * left.shape[0]
-    there, lower = there[near], lower[near]
+    near = np.abs(apart[:, 1]) < MAX_SHARE * left.shape[0]
+    return there[near], apart[near]
+
+
+def range_missed(apart: F64, disparities: tuple[float, float]) -> tuple[float, float] | None:
+    """Disparities that most of the features ``apart`` (N, 2) px have, where they are not those
+    looked for; None where enough are."""
+    found = apart[:, 0]
+    if len(found) < MIN_MATCHES or _within(found, disparities).mean() >= MIN_CONSENT:
+        return None
+    low, high = np.percentile(found, RANGE_PERCENTILES)
+    return float(low), float(high)
+
+
+def _within(found: F64, disparities: tuple[float, float]) -> Bool:
+    return (found >= disparities[0] - 1) & (found <= disparities[1] + 1)
+
+
+def rows_apart(
+    size: tuple[int, int], there: F64, apart: F64, disparities: tuple[float, float]
+) -> F64 | None:
+    """(3,) a, b, c: what the right image shows at (u, v) lies a + b u + c v px lower than in the
+    left one, of this (h, w), by features whose disparity is within ``disparities``, ``there`` and
+    ``apart`` as of :func:`features_apart`. None where rows surely do not differ, or too little
+    agrees on how.
+    """
+    near = _within(apart[:, 0], disparities)
+    there, lower = there[near], -apart[near, 1]
     if len(lower) < MIN_MATCHES:
         return None
     terms = np.column_stack([np.ones(len(there)), there])
@@ -37,7 +60,7 @@ def rows_apart(left: U8, right: U8, disparities: tuple[float, float]) -> F64 | N
         if good.sum() < max(MIN_MATCHES, MIN_CONSENT * len(lower)):
             return None
         fit = np.linalg.lstsq(terms[good], lower[good], rcond=None)[0]
-    h, w = left.shape
+    h, w = size
     corners = np.array([[1, u, v] for u in (0, w) for v in (0, h)]) @ fit
     return fit if np.abs(corners).max() > MIN_OFF_PX else None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,10 @@ from service.scans.writing import check_writable, write_whole, writing
 if TYPE_CHECKING:
     from recon.stereo.belief_propagation import BeliefPropagationConfig
     from recon.types import F32, U8
+
+log = logging.getLogger(__name__)
+
+MIN_SIDE_PX = 8
 
 Labels = Annotated[int, typer.Option(help="number of disparities")]
 MinDisparity = Annotated[int, typer.Option(help="the smallest disparity, px")]
@@ -52,7 +57,12 @@ def stereo(
     where one image is blurred, the other is blurred as much, and a little are both where noise
     hides what they show.
     """
-    from recon.calibration.row_alignment import rows_aligned, rows_apart
+    from recon.calibration.row_alignment import (
+        features_apart,
+        range_missed,
+        rows_aligned,
+        rows_apart,
+    )
     from recon.image_quality import alike
     from service.compute.backend_choice import choose_backend, load_learned_model
 
@@ -62,12 +72,24 @@ def stereo(
             f"{left} is {_size(gray_left)} but {right} is {_size(gray_right)}: "
             "a rectified pair has one size"
         )
+    if min(gray_left.shape) < MIN_SIDE_PX:
+        raise InputError(f"{left} is {_size(gray_left)}: sides are {MIN_SIDE_PX} px at least")
     config = matching_config(labels, iterations, min_disparity, checked)
     check_output(out, ".npy")
     if image is not None:
         check_output(image, ".png")
     chosen = choose_backend(backend) if model is None else load_learned_model(model)
-    apart = rows_apart(gray_left, gray_right, (min_disparity, min_disparity + labels))
+    looked_for = min_disparity, min_disparity + labels
+    there, features = features_apart(gray_left, gray_right)
+    apart = rows_apart(gray_left.shape, there, features, looked_for)
+    missed = range_missed(features, looked_for)
+    if missed is not None:
+        low, high = missed
+        log.warning(
+            "Most features have disparities of %.0f to %.0f px, not %d to %d: set "
+            "--min-disparity and --labels%s", low, high, *looked_for,
+            ", or give the images in the other order" if high <= 0 else "",
+        )  # fmt: skip
     if apart is not None:
         gray_right = rows_aligned(gray_right, apart)
     gray_left, gray_right, *blurs_px = alike(gray_left, gray_right)
@@ -178,8 +200,8 @@ def export_model(
     px.
     """
     width, height = parse_size(size)
-    if not (8 <= width <= 8192 and 8 <= height <= 8192):
-        raise InputError(f"--size {size!r}: sides are 8 to 8192")
+    if not all(MIN_SIDE_PX <= side <= 8192 for side in (width, height)):
+        raise InputError(f"--size {size!r}: sides are {MIN_SIDE_PX} to 8192")
     check_output(out, ".onnx")
     config = matching_config(labels, iterations, min_disparity, checked=False)
     with needing("export-model"):

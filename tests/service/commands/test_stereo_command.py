@@ -94,6 +94,30 @@ def test_rows_that_lie_apart_are_brought_together(
     assert np.nanmean(off < 0.5) > 0.98 and np.isfinite(off).mean() > 0.95
 
 
+@pytest.mark.parametrize(
+    ("order", "first", "words"),
+    [(1, 0, ""), (-1, 0, "or give the images in the other order"), (1, 40, "--min-disparity")],
+)
+def test_disparities_that_are_not_looked_for_are_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, order: int, first: int, words: str
+) -> None:
+    canvas = np.random.default_rng(0).normal(128, 90, (240, 400)).astype(np.float32)
+    canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), 1.3)).clip(0, 255).astype(np.uint8)
+    names = tmp_path / "a.png", tmp_path / "b.png"
+    for name, first_px in zip(names[::order], (60, 69), strict=True):
+        cv2.imwrite(str(name), canvas[:, first_px : first_px + 320])
+    words_of = ("--labels", 16, "--min-disparity", first, "--out", tmp_path / "d.npy")
+    assert run("stereo", *names, *words_of, "--backend", "cpu") == 0
+    assert words in caplog.text and ("disparities of" in caplog.text) == bool(words)
+
+
+def test_an_image_of_a_pixel_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = tmp_path / "a.png"
+    cv2.imwrite(str(name), np.zeros((1, 1), np.uint8))
+    assert run("stereo", name, name, "--labels", 2, "--out", tmp_path / "d.npy") == 2
+    assert "sides are 8 px at least" in capsys.readouterr().err
+
+
 def found_by(tmp_path: Path, left: Any, right: Any) -> Any:
     """Disparity by the command, of two images as they are stored in PNG."""
     names = tmp_path / "a.png", tmp_path / "b.png"
