@@ -26,7 +26,9 @@ PAIR = re.compile(r"(-?(?:\d+\.?\d*|\.\d+)):(-?(?:\d+\.?\d*|\.\d+))", re.ASCII)
 @dataclass(frozen=True)
 class SimulateOptions:
     out: Annotated[Path, typer.Option(help="Folder for the flight and its truth.")]
-    seed: Annotated[int, typer.Option(help="Seed of the site and of all random numbers.")] = 1
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the site and of all random numbers.")
+    ] = 1
     duration_s: Annotated[float, typer.Option(help="Length of the video.")] = 30.0
     height_m: Annotated[float, typer.Option(help="Height above the ground at the start.")] = 60.0
     speed_m_s: Annotated[float, typer.Option(help="Speed over ground.")] = 5.0
@@ -60,7 +62,7 @@ class SimulateOptions:
         typer.Option(help="Side of the site, the flight in its middle; for several flights."),
     ] = None
     flight_seed: Annotated[
-        int | None, typer.Option(help="Seed of motion and sensors; default: --seed.")
+        int | None, typer.Option(min=0, help="Seed of motion and sensors; default: --seed.")
     ] = None
     changes: Annotated[
         int, typer.Option(help="Boxes; half stand at --date 1, half at --date 2.")

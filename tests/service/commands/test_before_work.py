@@ -41,6 +41,12 @@ def test_simulate_refuses_a_folder_in_use_before_it_works(tmp_path: Path, name: 
     assert ended.returncode == 2 and ended.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("option", ["--seed", "--flight-seed"])
+def test_simulate_names_a_seed_that_is_none(tmp_path: Path, option: str) -> None:
+    ended = skyrelief("simulate", "--out", tmp_path / "a", option, "-1")
+    assert ended.returncode == 2 and option in ended.stderr
+
+
 def test_replay_refuses_a_view_that_is_too_narrow(tmp_path: Path) -> None:
     """What it would make lies hundreds of metres from where it is."""
     from PIL import Image
