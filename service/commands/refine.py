@@ -51,9 +51,12 @@ def refine(
     from service.offline.refine.refinement import intrinsics as run_intrinsics
     from service.offline.refine.refinement import refine as run
     from service.offline.refine.refinement import undo as run_undo
+    from service.scans.writing import check_writable
 
     if marks and not gcp:
         raise InputError("--marks needs --gcp with the points")
+    if scan_dir.is_dir() and not intrinsics:
+        check_writable(out or scan_dir, is_folder=True)
     lines = _lines
     with showing("refine") as progress:
         if intrinsics:

@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import command_process, interruptible, skyrelief
+from file_modes import bound_by_modes
 from house_flight import HouseFlight
 from loopback import until
 
 from recon.types import Camera
 from service.cameras.camera_file import save_camera
-from service.commands import replay
+from service.commands import refine, replay
 from service.compute import backend_choice
+from service.errors import OutsideError
 from service.offline.exports import EXPORTERS, kind_of
 from service.progress import Progress
 
@@ -74,6 +76,15 @@ def test_a_stopped_simulation_leaves_nothing(tmp_path: Path) -> None:
         simulating.send_signal(signal.SIGINT)
         assert simulating.wait(120.0) != 0
     assert list(place.iterdir()) == []
+
+
+def test_refine_refuses_a_folder_that_cannot_be_written(scan: Path) -> None:
+    scan.chmod(0o555)
+    try:
+        with pytest.raises(OutsideError, match="no rights to write in"):
+            bound_by_modes(lambda: refine.refine(scan))
+    finally:
+        scan.chmod(0o755)
 
 
 def test_a_refused_refinement_leaves_no_folder(scan: Path, tmp_path: Path) -> None:
