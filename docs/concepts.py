@@ -14,6 +14,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.types import F64, PosePrior
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -116,7 +117,7 @@ def track() -> dict[str, F64]:
             odom = odom @ se3.exp(rng.multivariate_normal(np.zeros(6), covariance)) @ step
         fix = pose[:3, 3] + rng.normal(0.0, FIX_M, 3)
         prior = PosePrior(pose[:3, :3], 0.02, 0.1, fix, np.full(3, FIX_M))
-        known = graph.add_keyframe(seq, seq * 10**9, 1, odom, covariance, prior)
+        known = graph.add_keyframe(Node(seq, seq * 10**9, 1, odom, covariance, prior))
         at = se3.about(known.T_world_camera[:3, 3], known.covariance)
         first.append(known.T_world_camera[:2, 3])
         sigma.append(np.sqrt(np.trace(at[3:5, 3:5]) / 2.0))

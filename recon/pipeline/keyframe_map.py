@@ -19,6 +19,7 @@ from recon.pipeline.views import StereoView
 from recon.posegraph.ground import MAX_LEVELLED_SHARE, height_above, height_below, levelled
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
 from recon.types import F32, F64, Bool, DepthMap, Keyframe, Pose, Verdict
@@ -70,13 +71,15 @@ class KeyframeMap:
         T_odom, (step, covariance) = view.image.T_odom_camera, self._step(view, depth)
         T_chain = T_odom if step is None else self.trajectory.odom_pose(self._newest) @ step
         up = T_odom[2, :3]
-        below = height_below(depth, up) if depth is not None else None
-        height = (below, 0.0) if below is not None else height_above(view.points, up)
+        height, slant = height_below(depth, up) if depth is not None else None, 0.0
+        if height is None:
+            height, slant = height_above(view.points, up) or (None, 0.0)
         prior = levelled(view.frame.prior, view.points)
         self._newest, self._depth = view.seq, depth
         self._levelled += prior is not view.frame.prior
+        time_ns = view.frame.time_ns
         self.trajectory.add(
-            view.seq, view.segment, T_chain, prior, height, view.frame.time_ns, covariance
+            Node(view.seq, time_ns, view.segment, T_chain, covariance, prior, height, slant)
         )
         if depth is not None and self._loops is not None:
             with self._timing("loops"):

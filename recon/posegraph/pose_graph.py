@@ -56,35 +56,13 @@ class PoseGraph:
 
     # ---- what goes in --------------------------------------------------------------------------
 
-    def add_keyframe(
-        self,
-        seq: int,
-        time_ns: int,
-        segment: int,
-        T_odom_camera: F64,
-        covariance: F64,
-        prior: PosePrior,
-        height: tuple[float, float] | None = None,
-    ) -> Pose:
-        """Add a keyframe; returns its pose by all evidence.
+    def add_keyframe(self, node: Node) -> Pose:
+        """Add a keyframe, newer than those before; returns its pose by all evidence.
 
         Of more than ``max_nodes`` some older ones stop being nodes: their motions are those of
         the neighbouring nodes (:mod:`recon.posegraph.thinning`), and the graph is rebuilt.
-
-        Args:
-            seq: number of the keyframe; greater than those before.
-            segment: keyframes tracked without interruption; each has an odometry frame of its own.
-            T_odom_camera: (4, 4) in the segment's frame.
-            covariance: (6, 6) of the motion since the last keyframe, a left perturbation in
-                the last camera's frame, in units of the odometry.
-            prior: telemetry at this moment; parts may be missing.
-            height: above ground as :func:`recon.posegraph.ground.height_above` gives it.
         """
-        above, slant = height if height is not None else (None, 0.0)
-        node = Node(
-            seq, len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
-            np.array(covariance, np.float64), self._fresh(sound(prior)), above, slant,
-        )  # fmt: skip
+        node = replace(node, key=len(self._nodes), prior=self._fresh(sound(node.prior)))
         last = self._newest() if self._nodes else None
         self.entered += 1
         self._nodes[node.seq] = node
@@ -96,7 +74,7 @@ class PoseGraph:
         else:
             self._factors.add(node, last)
             self._solve()
-        return self.pose(seq)
+        return self.pose(node.seq)
 
     def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
         """True when the loop bent the graph; False while it waits for another that agrees.

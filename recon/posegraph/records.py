@@ -12,15 +12,17 @@ from recon.types import F64, PosePrior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
+    """A keyframe of the graph, in units of the odometry."""
+
     seq: int
-    key: int  # in the graph
     time_ns: int
-    segment: int
+    segment: int  # keyframes tracked without interruption; each has an odometry frame of its own
     T_odom_camera: F64  # (4, 4) in the segment's chain
     covariance: F64  # (6, 6) of the motion since the node before, left, in that camera's frame
-    prior: PosePrior
-    height: float | None = None  # above the ground that it sees, in odometry units
+    prior: PosePrior  # telemetry at this moment; parts may be missing
+    height: float | None = None  # above the ground that it sees
     slant: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
+    key: int = -1  # in the graph, which gives it
     weight: int = 1  # keyframes since the node before, this one among them
     T_prev_segment: F64 | None = None  # (4, 4) m, since the node before, of another segment
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.poses import sigma_m
 from recon.table import Rows, Table
-from recon.types import F64, I64, Bool, Pose, PosePrior
+from recon.types import F64, I64, Bool, Pose
 
 REPOSE_M, REPOSE_SIGMAS = 0.05, 0.1
 """In flight a corrected pose is published that moves the keyframe or its ground by more than this,
@@ -57,22 +58,13 @@ class Trajectory:
         self._generation = 0  # of the graph
         self._checked = -1  # version of the graph that all published poses follow
 
-    def add(
-        self,
-        seq: int,
-        segment: int,
-        T_odom_camera: F64,
-        prior: PosePrior,
-        height: tuple[float, float] | None,
-        time_ns: int,
-        covariance: F64,
-    ) -> None:
+    def add(self, node: Node) -> None:
         """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`."""
-        self.graph.add_keyframe(seq, time_ns, segment, T_odom_camera, covariance, prior, height)
+        self.graph.add_keyframe(node)
         row = np.zeros(1, KEYFRAME)
-        row["seq"], row["segment"], row["T_odom_camera"] = seq, segment, T_odom_camera
-        row["height"] = height[0] if height is not None and height[0] else 1.0
-        self._row[seq] = len(self._table)
+        row["seq"], row["segment"], row["height"] = node.seq, node.segment, node.height or 1.0
+        row["T_odom_camera"] = node.T_odom_camera
+        self._row[node.seq] = len(self._table)
         self._table.append(row)
         if self.graph.generation == self._generation:
             self._nodes = np.append(self._nodes, len(self._table) - 1)

@@ -13,6 +13,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
 from recon.types import F64, Pose, PosePrior
@@ -143,7 +144,7 @@ def _keyframe(flight: _Course, i: int, flown: _TimedTrajectory) -> None:
     """One keyframe with all that a flight asks of the graph for it."""
     T, prior, trajectory = flight.odometry[i], flight.priors[i], flown.trajectory
     begun = time.perf_counter()
-    trajectory.add(i, 0, T, prior, (HEIGHT_M / 1.3, 0.0), i * 1_000_000_000, flight.covariance)
+    trajectory.add(Node(i, i * 10**9, 0, T, flight.covariance, prior, HEIGHT_M / 1.3))
     trajectory.publish(i, trajectory.pose(i))
     partner, is_taken, before = _opposite(i), False, time.perf_counter()
     if i % LOOP_EVERY == 0 and partner is not None:

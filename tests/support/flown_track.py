@@ -51,4 +51,4 @@ def node(
 ) -> Node:  # fmt: skip
     """A keyframe with its telemetry, of no graph."""
     time_ns = round(1e9 * time_s)
-    return Node(0, 0, time_ns, 0, T_odom_camera, np.zeros((6, 6)), prior, height, slant)
+    return Node(0, time_ns, 0, T_odom_camera, np.zeros((6, 6)), prior, height, slant)

@@ -14,6 +14,7 @@ from recon.mapping.disagreement import MIN_FACTOR
 from recon.mapping.voxel_map import VoxelMap, tiles_under
 from recon.pipeline.keyframe_map import SurfaceMap
 from recon.pipeline.views import KNOWN_ROWS
+from recon.posegraph.records import Node
 from recon.types import F64, Camera, DepthMap, PosePrior
 from service.config import load_config
 from service.flight.paged_map import MAX_OVER, PagedMap
@@ -117,7 +118,7 @@ def test_pages_of_a_map_that_begins_at_the_very_end_are_removed(
     def drain() -> tuple[()]:
         for seq, depth in enumerate(survey()[:40]):
             T, track = depth.T_world_camera, pipeline.mapper.keyframes.trajectory
-            track.add(seq, 0, T, PosePrior(), None, seq, 1e-6 * np.eye(6))
+            track.add(Node(seq, seq, 0, T, 1e-6 * np.eye(6), PosePrior()))
             pipeline.mapper.surface(seq, 0, depth, KNOWN_ROWS, T)
         assert pages.exists() and pipeline.held["map_tiles_on_disk"] > 0
         return ()

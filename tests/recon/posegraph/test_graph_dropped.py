@@ -38,8 +38,8 @@ def fly(trajectory: Trajectory, first: int = 0, count: int = COUNT, fixes: bool 
         segment = i // EACH
         T = se3.inverse(odom[EACH * segment]) @ odom[i]
         prior = priors[i] if fixes else PosePrior()
-        height = (HEIGHT_M / SCALE, 0.0) if fixes else None
-        trajectory.add(i, segment, T, prior, height, i * 10**9, SPREAD * UNITS)
+        height = HEIGHT_M / SCALE if fixes else None
+        trajectory.add(Node(i, i * 10**9, segment, T, SPREAD * UNITS, prior, height))
         publish(trajectory, i)
         most = max(most, len(trajectory.graph))
     return most
@@ -128,7 +128,7 @@ def nodes_of(sizes: list[int]) -> list[Node]:
     """Nodes a metre apart along x, in segments of these sizes."""
     segments = [segment for segment, size in enumerate(sizes) for _ in range(size)]
     return [
-        Node(i, i, i, segment, se3.compose(np.eye(3), np.array([i, 0.0, 0.0])), np.eye(6),
+        Node(i, i, segment, se3.compose(np.eye(3), np.array([i, 0.0, 0.0])), np.eye(6),
              PosePrior())
         for i, segment in enumerate(segments)
     ]  # fmt: skip
@@ -158,7 +158,7 @@ def test_unpublished_keyframes_of_a_dropped_segment_follow_the_node_before() -> 
     trajectory, (_, odom, priors) = Trajectory(graph=bounded()), flight()
     for i in range(2 * MOST):
         T = se3.inverse(odom[i - i % EACH]) @ odom[i]
-        trajectory.add(i, i // EACH, T, priors[i], None, i * 10**9, SPREAD * UNITS)
+        trajectory.add(Node(i, i * 10**9, i // EACH, T, SPREAD * UNITS, priors[i]))
     before, after = next((a, b) for a, b in pairwise(trajectory.graph.seqs) if b - a > EACH)
     node, found = trajectory.pose(before), trajectory.pose(after - 1)
     np.testing.assert_array_equal(found.T_world_camera, node.T_world_camera)
@@ -172,7 +172,7 @@ def test_rounding_errors_do_not_grow_from_break_to_break(fixes: bool) -> None:
     for i in range(0, FLOWN, 2):
         prior = priors[i] if fixes else PosePrior()
         T = np.eye(4) if i % 4 == 0 else se3.inverse(odom[i - 2]) @ odom[i]
-        trajectory.add(i, i // 4, T, prior, None, i * 10**9, SPREAD * UNITS)
+        trajectory.add(Node(i, i * 10**9, i // 4, T, SPREAD * UNITS, prior))
     trajectory.graph.solve()
     R = trajectory.graph.poses()[:, :3, :3]
     eyes = np.tile(np.eye(3), (len(R), 1, 1))

@@ -16,6 +16,7 @@ from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 
@@ -54,8 +55,8 @@ def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
             time_ns += 2 * 10**9
         time_ns += 10**9
         T = se3.inverse(odom[start]) @ odom[i]
-        height = (HEIGHT_M / hard.scale, 0.0)
-        trajectory.add(i, segment, T, prior, height, time_ns, SPREAD * np.outer(units, units))
+        height = HEIGHT_M / hard.scale
+        trajectory.add(Node(i, time_ns, segment, T, SPREAD * np.outer(units, units), prior, height))
         a = int(rng.integers(0, i - 20)) if i > 30 else -1
         if rng.random() < 0.15 and a in trajectory:
             T = se3.inverse(truth[a]) @ truth[i]

@@ -39,8 +39,8 @@ def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:
     """Every keyframe entered and published, with loops between neighbouring legs."""
     truth, odom, priors = flight()
     for i in range(first, count):
-        height = (HEIGHT_M / SCALE, 0.0)
-        trajectory.add(i, 0, odom[i], priors[i], height, i * 10**9, SPREAD * UNITS)
+        height = HEIGHT_M / SCALE
+        trajectory.add(Node(i, i * 10**9, 0, odom[i], SPREAD * UNITS, priors[i], height))
         leg, along = divmod(i, LEG)
         if leg and 10 < along < LEG - 10 and i % 4 == 0:
             other = leg * LEG - 1 - along
@@ -140,7 +140,7 @@ def test_composed_motions_and_moved_loops_have_the_spread_of_many_trials() -> No
     chain = [np.eye(4)]
     for step in steps:
         chain.append(chain[-1] @ step)
-    nodes = [Node(i, i, i, 0, T, spreads[max(i - 1, 0)], PosePrior()) for i, T in enumerate(chain)]
+    nodes = [Node(i, i, 0, T, spreads[max(i - 1, 0)], PosePrior()) for i, T in enumerate(chain)]
     kept, marginalised = thinned(nodes, {1})
     assert [n.key for n in kept] == [0, 1, 2] and kept[1].weight == 2
     noise = [rng.multivariate_normal(np.zeros(6), S, 4000) for S in spreads]
@@ -173,7 +173,7 @@ def test_a_loop_to_an_interpolated_keyframe_is_as_unsure_as_vision_on_the_way_to
     """It begins at the node before: the way on to the node after has no part in it."""
     trajectory, (_, odom, priors) = Trajectory(graph=bounded(8)), flight()
     for i in range(16):
-        trajectory.add(i, 0, odom[i], priors[i], None, i * 10**9, SPREAD * UNITS)
+        trajectory.add(Node(i, i * 10**9, 0, odom[i], SPREAD * UNITS, priors[i]))
     graph = trajectory.graph
     before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a >= 3)
     taken: list[tuple[int, F64]] = []
@@ -189,7 +189,7 @@ def test_a_loop_to_an_interpolated_keyframe_is_as_unsure_as_vision_on_the_way_to
 
 def test_ends_of_segments_stay() -> None:
     nodes = [
-        Node(i, i, i, i // 7, np.eye(4), np.eye(6), PosePrior()) for i in range(70)
+        Node(i, i, i // 7, np.eye(4), np.eye(6), PosePrior()) for i in range(70)
     ]  # fmt: skip
     for _ in range(5):
         nodes, _ = thinned(nodes, surplus(nodes))
@@ -202,7 +202,7 @@ def test_of_short_segments_those_that_leave_the_smallest_holes_go_first() -> Non
     """Two views each, the segments closer and closer to each other; none goes beside a hole."""
     firsts = np.cumsum([40 - 3 * n for n in range(10)])
     nodes = [
-        Node(int(firsts[i // 2]) + i % 2, i, i, i // 2, np.eye(4), np.eye(6), PosePrior())
+        Node(int(firsts[i // 2]) + i % 2, i, i // 2, np.eye(4), np.eye(6), PosePrior())
         for i in range(20)
     ]
     gone = surplus(nodes)

@@ -116,10 +116,9 @@ def settled(flown: Stills, broken_at: int = 10**6, turn_rad: float = 1e-4) -> Tr
     trajectory, start = Trajectory(), np.eye(4)
     for k, one in enumerate(flown.nodes):
         start = se3.inverse(one.T_odom_camera) if k == broken_at else start
-        trajectory.add(
-            k, int(k >= broken_at), start @ one.T_odom_camera, one.prior, None,
-            round(one.time_s * 1e9), np.diag([turn_rad**2] * 3 + [0.01**2] * 3),
-        )  # fmt: skip
+        T, time_ns = start @ one.T_odom_camera, round(one.time_s * 1e9)
+        covariance = np.diag([turn_rad**2] * 3 + [0.01**2] * 3)
+        trajectory.add(Node(k, time_ns, int(k >= broken_at), T, covariance, one.prior))
     trajectory.moved(final=True)
     return trajectory
 

@@ -18,6 +18,7 @@ from recon.posegraph import loop_search
 from recon.posegraph.loop_closure import LoopEnd, candidates, ground_seen, verify
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, DepthMap, PosePrior
 
@@ -223,7 +224,7 @@ def test_two_verified_loops_close_the_map() -> None:
             noise = se3.exp(rng.multivariate_normal(np.zeros(6), covariance))
             odom = odom @ noise @ se3.inverse(last) @ T
         last = T
-        graph.add_keyframe(i, i * 10**9, 0, odom, covariance, PosePrior())
+        graph.add_keyframe(Node(i, i * 10**9, 0, odom, covariance, PosePrior()))
     flown = graph.poses()
     before = np.linalg.norm(
         (se3.inverse(flown[4]) @ flown[55] - se3.inverse(poses[4]) @ poses[55])[:3, 3]
@@ -252,7 +253,7 @@ def test_lengths_that_are_all_as_unsure_leave_the_scale_as_it_is() -> None:
     for i, T in lawnmower().items():
         fix = T[:3, 3] + rng.normal(0.0, 1.0, 3)
         prior = PosePrior(T[:3, :3], 0.02, 0.1, fix, np.full(3, 1.0))
-        graph.add_keyframe(i, i * 10**9, 0, T, covariance, prior)
+        graph.add_keyframe(Node(i, i * 10**9, 0, T, covariance, prior))
     assert len({graph.scale(i) for i in range(len(graph))}) <= 5
 
 
@@ -269,7 +270,7 @@ def test_a_loop_joins_the_scales_of_its_ends() -> None:
         fix = T[:3, 3] + rng.normal(0.0, 3.0, 3)
         prior = PosePrior(T[:3, :3], 0.02, 0.1, fix, np.full(3, 3.0))
         unsure = 20.0 if i == 30 else 1.0
-        graph.add_keyframe(i, i * 10**9, 0, odom, unsure**2 * covariance, prior)
+        graph.add_keyframe(Node(i, i * 10**9, 0, odom, unsure**2 * covariance, prior))
     assert abs(graph.scale(55) / graph.scale(4) * DRIFT - 1.0) > 0.01
     for a, b in ((4, 55), (9, 50)):
         T_a_b = se3.inverse(poses[a]) @ poses[b]
@@ -292,7 +293,7 @@ def test_a_segment_that_loops_shrink_tells_by_how_much() -> None:
         fix = start + 0.9 * (T[:3, 3] - start) if is_first else T[:3, 3] + rng.normal(0.0, 3.0, 3)
         sigma = np.full(3, 0.02 if is_first else 3.0)
         prior = PosePrior(T[:3, :3], 0.02, 0.1, fix, sigma)
-        graph.add_keyframe(i, i * 10**9, int(not is_first), T, covariance, prior)
+        graph.add_keyframe(Node(i, i * 10**9, int(not is_first), T, covariance, prior))
     graph.solve()
     assert abs(graph.largest_growth()) < 0.03
     for a, b in ((4, 55), (6, 53)):
@@ -311,7 +312,7 @@ def search_along(poses: list[F64], chain: list[F64], segment: list[int]) -> Loop
     search = LoopSearch(trajectory, min_gap=5)
     covariance = np.diag([4e-3**2] * 3 + [0.1**2] * 3)
     for i, (T, odom) in enumerate(zip(poses, chain, strict=True)):
-        trajectory.add(i, segment[i], odom, PosePrior(), None, i * 10**9, covariance)
+        trajectory.add(Node(i, i * 10**9, segment[i], odom, covariance, PosePrior()))
         seen = view(T, i)
         search.add(i, segment[i], seen.gray, K, seen.depth)
     return search
@@ -379,7 +380,7 @@ def test_after_a_loop_the_search_waits_until_the_view_has_moved_on() -> None:
     diagonal_m = float(np.nanmedian(seen.depth.depth_m)) * float(np.hypot(W, H)) / K[0, 0]
     for i, share in enumerate((0.0, 0.1, 0.2, 0.3, 0.31, 0.32, 0.33, 0.34)):
         T = camera(share * diagonal_m, 0.0, 40.0, 0.0)
-        trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
+        trajectory.add(Node(i, i * 10**9, 0, T, np.eye(6) * 1e-4, PosePrior()))
         search.add(i, 0, seen.gray, K, seen.depth)
     assert searched == [0, 3, 7]
 
@@ -391,7 +392,7 @@ def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPa
     rng = np.random.default_rng(4)
     for i in range(20):
         T = camera(300.0 * i, 0.0, 40.0, 0.0)
-        trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
+        trajectory.add(Node(i, i * 10**9, 0, T, np.eye(6) * 1e-4, PosePrior()))
         search.add(i, 0, rng.integers(0, 255, seen.gray.shape, np.uint8), K, seen.depth)
         assert len(search) <= 6
     assert not verified.called

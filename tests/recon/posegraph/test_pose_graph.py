@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recon import parallel, se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.posegraph.smoother import NO_SCALE, Smoother, State, System
 from recon.posegraph.trajectory import Trajectory
 from recon.similarity import umeyama
@@ -78,7 +79,7 @@ def fly(
         if altitude_bias_m is not None:
             altitude = f.truth[i][2, 3] + altitude_bias_m + rng.normal() * 0.2
             prior = replace(prior, altitude_m=altitude, sigma_altitude_m=0.2)
-        pose = graph.add_keyframe(i, i * every_s * 10**9, 0, T, f.covariance, prior)
+        pose = graph.add_keyframe(Node(i, i * every_s * 10**9, 0, T, f.covariance, prior))
     assert pose is not None
     return graph, pose
 
@@ -320,10 +321,10 @@ def test_a_stretch_without_vision_is_bridged_and_said() -> None:
     f, later = flight(120), flight(120, scale=0.6)
     graph = PoseGraph()
     for i in range(50):
-        graph.add_keyframe(i, i * 10**9, 0, f.odom[i], f.covariance, f.priors[i])
+        graph.add_keyframe(Node(i, i * 10**9, 0, f.odom[i], f.covariance, f.priors[i]))
     for i in range(56, 120):
         odom = later.odom[i]  # the same flight, found again in a frame of another scale
-        pose = graph.add_keyframe(i, i * 10**9, 1, odom, later.covariance, f.priors[i])
+        pose = graph.add_keyframe(Node(i, i * 10**9, 1, odom, later.covariance, f.priors[i]))
         if i == 56:
             assert "dead reckoning" in pose.sources and "vision" not in pose.sources
             assert not graph.segments[1].rests_on_fixes
@@ -343,9 +344,9 @@ def test_without_fixes_a_gap_is_bridged_at_the_last_velocity(burst_ns: int) -> N
     graph = PoseGraph()
     for i in range(20):
         time_ns = i * 10**9 - (burst_ns if i == 19 else 0)
-        graph.add_keyframe(i, time_ns, 0, f.odom[i], f.covariance, blind(f.priors[i], True))
+        graph.add_keyframe(Node(i, time_ns, 0, f.odom[i], f.covariance, blind(f.priors[i], True)))
     pose = graph.add_keyframe(
-        24, 24 * 10**9, 1, f.odom[24], f.covariance, blind(f.priors[24], True)
+        Node(24, 24 * 10**9, 1, f.odom[24], f.covariance, blind(f.priors[24], True))
     )
     moved = pose.T_world_camera[:3, 3] - graph.pose(19).T_world_camera[:3, 3]
     true = f.truth[24][:3, 3] - f.truth[19][:3, 3]
@@ -369,7 +370,7 @@ def test_without_fixes_the_barometer_goes_on_over_a_gap() -> None:
         z = f.truth[i][2, 3] + later * climb_m[2] + 80.0
         prior = replace(blind(f.priors[i], True), altitude_m=z, sigma_altitude_m=0.3)
         T = se3.inverse(f.odom[24 * later]) @ f.odom[i]
-        graph.add_keyframe(i, i * 10**9, int(later), T, f.covariance, prior, (60.0, 0.0))
+        graph.add_keyframe(Node(i, i * 10**9, int(later), T, f.covariance, prior, 60.0))
     assert not graph.counts["altitude off"]
     before, after = (np.array([graph.pose(i).T_world_camera[2, 3] for i in part])
                      for part in (range(16), range(24, 70)))  # fmt: skip
@@ -392,8 +393,8 @@ def to_and_fro(breaks: int, seed: int) -> PoseGraph:
             mount = se3.so3_exp(rng.normal(0, 0.02, 3)) @ down
             prior = PosePrior(mount, 0.1, 3.0, None, None, 50.0, 25.0)
             T = se3.compose(R, np.array([0.0, y_m - start_m, 0.0]))
-            height = (50.0 + rng.normal(0, 0.3), 0.0)
-            graph.add_keyframe(8 * n, time_ns, segment, T, covariance, prior, height)
+            height = 50.0 + rng.normal(0, 0.3)
+            graph.add_keyframe(Node(8 * n, time_ns, segment, T, covariance, prior, height))
             n, time_ns = n + 1, time_ns + 800_000_000
         n, time_ns = n + 8, time_ns + 6_400_000_000
     return graph
@@ -416,7 +417,7 @@ def test_fixes_that_drift_do_not_stretch_the_graph_beyond_the_similarity() -> No
         assert prior.position_m is not None
         drift_m = 0.02 * (f.truth[i][:3, 3] - middle) * [1.0, 1.0, 0.0]
         prior = replace(prior, position_m=prior.position_m + drift_m, agl_m=60.0, sigma_agl_m=0.3)
-        graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, (60.0 / 1.3, 0.0))
+        graph.add_keyframe(Node(i, i * 10**9, 0, T, f.covariance, prior, 60.0 / 1.3))
     graph.solve()
     assert graph.scale(30) == pytest.approx(1.3, rel=0.006)
 
@@ -495,7 +496,7 @@ def test_wandering_fixes_do_not_bend_what_vision_sees_straight() -> None:
     covariance = f.covariance
     graph = PoseGraph()
     for i, (T, p) in enumerate(zip(f.odom, f.priors, strict=True)):
-        graph.add_keyframe(i, i * 10**9, 0, T, covariance, p)
+        graph.add_keyframe(Node(i, i * 10**9, 0, T, covariance, p))
     graph.solve()
 
     def shape_m(track: F64) -> float:
@@ -578,10 +579,10 @@ def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:
     turned = se3.compose(se3.so3_exp(np.array([0.0, 0.0, 2.0])), np.array([40.0, -70.0, 5.0]))
     graph = PoseGraph()
     for i in range(12):
-        graph.add_keyframe(i, i * 10**9, 0, f.odom[i], f.covariance, PosePrior())
+        graph.add_keyframe(Node(i, i * 10**9, 0, f.odom[i], f.covariance, PosePrior()))
     for i in range(12, 24):
         graph.add_keyframe(
-            i, (i + 20) * 10**9, 1, turned @ later.odom[i], later.covariance, PosePrior()
+            Node(i, (i + 20) * 10**9, 1, turned @ later.odom[i], later.covariance, PosePrior())
         )
     assert not graph.segments[1].is_tied
     shrunk = 1.0 / graph.scale(20) * 0.5  # depths of the second stretch, as the first has them
@@ -618,7 +619,7 @@ def tied_stretch(
             R = R @ se3.so3_exp(np.array([0.0, mount_rad * is_tied, 0.0]))
             prior = replace(prior, R_world_camera=R, is_view_assumed=True)
         at = turned @ odom if is_tied else odom
-        graph.add_keyframe(i, (i + 20 * is_tied) * 10**9, int(is_tied), at, spread, prior)
+        graph.add_keyframe(Node(i, (i + 20 * is_tied) * 10**9, int(is_tied), at, spread, prior))
         if i == before + grown:
             for a, b in ((3, before + 3), (5, before + 6)):
                 seen = se3.inverse(f.truth[a]) @ f.truth[b]
@@ -676,7 +677,7 @@ def test_a_stretch_whose_scale_no_fix_measures_is_as_high_as_the_flight() -> Non
         prior = replace(prior, agl_m=50.0, sigma_agl_m=25.0, is_agl_measured=False)
         if i >= 60:
             prior = replace(prior, sigma_position_m=np.full(3, 60.0))
-        graph.add_keyframe(i, i * 10**9, int(i >= 60), T, f.covariance, prior, (60.0, 0.0))
+        graph.add_keyframe(Node(i, i * 10**9, int(i >= 60), T, f.covariance, prior, 60.0))
     graph.solve()
     assert graph.scale(30) == pytest.approx(3.0, rel=0.02)
     assert graph.scale(63) == pytest.approx(3.0, rel=0.3)
@@ -735,7 +736,7 @@ def test_readings_that_cannot_be_are_left_out(fault: dict[str, Any]) -> None:
     graph = PoseGraph()
     for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
         prior = replace(prior, **fault) if i % 5 == 0 else prior
-        graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, (60.0 / 1.3, 0.0))
+        graph.add_keyframe(Node(i, i * 10**9, 0, T, f.covariance, prior, 60.0 / 1.3))
         assert i < 3 or np.linalg.norm((graph.pose(i).T_world_camera - f.truth[i])[:3, 3]) < 5.0
     assert not graph.counts["solved badly"]
     graph.solve()

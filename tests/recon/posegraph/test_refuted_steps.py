@@ -12,6 +12,7 @@ from flown_track import SPREAD, sensed
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.types import F64, PosePrior
 from service.flight.reports import GraphWatch
 
@@ -33,7 +34,7 @@ def flown(smears: bool, tilts: bool = False, jumps: bool = False) -> tuple[list[
             T = T @ (se3.compose(TILT, 0.2 * step[:3, 3]) if smears and i in SMEARED else step)
         prior = faulty(prior, i - SMEARED[0] + 1, tilts, jumps) if i in SMEARED else prior
         units = np.array([1.0] * 3 + [1.0 / SCALE] * 3)
-        graph.add_keyframe(i, i * 10**9, 0, T, SPREAD * np.outer(units, units), prior)
+        graph.add_keyframe(Node(i, i * 10**9, 0, T, SPREAD * np.outer(units, units), prior))
     graph.solve()
     return truth, graph
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.posegraph.records import Node
 from recon.posegraph.trajectory import REPOSE_M, REPOSE_SIGMAS, Trajectory
 from recon.poses import carried, sigma_m
 from recon.types import F64, DepthMap, Keyframe, Pose, PosePrior
@@ -54,7 +55,7 @@ LOOP = np.diag([3e-4**2] * 3 + [0.02**2] * 3)
 def flown(truth: list[F64], chain: list[F64], height: float = HEIGHT_M) -> Trajectory:
     out = Trajectory()
     for i, (T, odom) in enumerate(zip(truth, chain, strict=True)):
-        out.add(10 * i, 0, odom, prior(T), (height, 0.0), i * 10**9, COVARIANCE)
+        out.add(Node(10 * i, i * 10**9, 0, odom, COVARIANCE, prior(T), height))
     return out
 
 
@@ -90,7 +91,7 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
         ScanStore.create(tmp_path / "ground.db", HEADER) as ground,
     ):
         for i, (T, odom) in enumerate(zip(truth, chain, strict=True)):
-            trajectory.add(10 * i, 0, odom, prior(T), (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
+            trajectory.add(Node(10 * i, i * 10**9, 0, odom, COVARIANCE, prior(T), HEIGHT_M))
             placed = trajectory.pose(10 * i)
             trajectory.publish(10 * i, placed)
             scales[10 * i] = placed.scale
@@ -168,7 +169,7 @@ def test_the_end_publishes_each_sigma_as_it_is() -> None:
     truth = legs()
     trajectory, published = Trajectory(), {}
     for i, T in enumerate(truth):
-        trajectory.add(10 * i, 0, T, prior(T), (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
+        trajectory.add(Node(10 * i, i * 10**9, 0, T, COVARIANCE, prior(T), HEIGHT_M))
         published[10 * i] = trajectory.pose(10 * i)
         trajectory.publish(10 * i, published[10 * i])
     assert sigma_m(published[0]) == pytest.approx(np.sqrt(3.0), rel=1e-3)
@@ -182,7 +183,7 @@ def test_the_end_publishes_each_sigma_as_it_is() -> None:
 def test_a_keyframe_that_nothing_aligns_is_no_surer_than_the_way_without_vision() -> None:
     trajectory = Trajectory()
     for i, T in enumerate(legs()[:8]):
-        trajectory.add(i, 0 if i < 7 else 1, T, PosePrior(), None, i * 10**9, COVARIANCE)
+        trajectory.add(Node(i, i * 10**9, 0 if i < 7 else 1, T, COVARIANCE, PosePrior()))
     assert sigma_m(trajectory.pose(6)) < 2.0
     assert sigma_m(trajectory.pose(7)) > 5.0
 
@@ -194,7 +195,7 @@ def test_a_scan_far_from_its_origin_is_as_sure_of_its_places() -> None:
         for i, T in enumerate(legs()):
             fix = T[:3, 3] + [away_m, 0.0, 0.0]
             known = replace(prior(T), position_m=fix, sigma_position_m=np.full(3, 1.0))
-            out.add(i, 0, T, known, (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
+            out.add(Node(i, i * 10**9, 0, T, COVARIANCE, known, HEIGHT_M))
         sigmas.append(sigma_m(out.pose(5)))
     assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-3)
     assert 1.0 < sigmas[0] < 2.0

@@ -9,6 +9,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.types import F64, PosePrior
 from service.flight.reports import GraphWatch
 
@@ -31,7 +32,7 @@ def warnings_of(priors: list[PosePrior]) -> tuple[list[str], GraphWatch]:
     graph, heard = PoseGraph(), list[str]()
     watch = GraphWatch(graph)
     for i, (T, p) in enumerate(zip(track(len(priors)), priors, strict=True)):
-        graph.add_keyframe(i, i * 10**9, 0, T, COVARIANCE, p, (60.0, 0.0))
+        graph.add_keyframe(Node(i, i * 10**9, 0, T, COVARIANCE, p, 60.0))
         heard += watch.new_findings()
     return heard, watch
 
@@ -99,6 +100,6 @@ def test_a_track_that_the_fixes_contradict_is_reported() -> None:
         fix = replace(prior(T), sigma_position_m=np.full(3, 0.05))
         swing = np.array([0.0, 3.0 * np.sin(0.5 * i), 1.5 * np.cos(0.5 * i)])
         seen = se3.compose(T[:3, :3], T[:3, 3] + swing)
-        graph.add_keyframe(i, i * 10**9, 0, seen, COVARIANCE, fix, (60.0, 0.0))
+        graph.add_keyframe(Node(i, i * 10**9, 0, seen, COVARIANCE, fix, 60.0))
         watch_said += watch.new_findings()
     assert sum("track and GNSS differ" in text for text in watch_said) == 1

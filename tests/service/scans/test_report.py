@@ -12,6 +12,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
 from recon.types import PosePrior
@@ -168,7 +169,7 @@ def test_figures_of_a_graph_are_its_own() -> None:
     for k, T in enumerate(truth):
         fix = T[:3, 3] + rng.normal(0, 0.3, 3)
         prior = PosePrior(T[:3, :3], 0.02, 0.05, fix, np.full(3, 0.5))
-        graph.add_keyframe(k, k * 10**9, 0, T, np.eye(6) * 1e-6, prior)
+        graph.add_keyframe(Node(k, k * 10**9, 0, T, np.eye(6) * 1e-6, prior))
     figures = graph_figures(graph)
     assert figures is not None
     rows = graph.residuals()
