@@ -17,7 +17,7 @@ from recon.mapping.voxel_map import VoxelMap
 from recon.pipeline.stages import Timing
 from recon.pipeline.views import StereoView
 from recon.posegraph.ground import MAX_LEVELLED_SHARE, height_above, height_below, levelled
-from recon.posegraph.loop_search import LoopSearch
+from recon.posegraph.loop_closure import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
@@ -174,7 +174,9 @@ class SurfaceMap:
         in_odom = replace(in_odom, sigma_m=in_odom.sigma_m * factor)
         known = self.known
         if known is None:
-            known = self.known = self._empty(depth)
+            ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
+            known = self._new_map(max(2.0 * ground_m, self._resolution_m, 1e-3))
+            self.known = known
         fresh = known.fresh(in_odom)
         known.insert(in_odom, fresh)
         return in_odom.sigma_m, fresh
@@ -191,10 +193,6 @@ class SurfaceMap:
         share = cv2.resize(rows_share, depth.depth_m.shape[::-1])
         sigma_m = np.hypot(depth.sigma_m, share * depth.depth_m)
         return replace(depth, sigma_m=sigma_m, T_world_camera=T_odom_camera)
-
-    def _empty(self, depth: DepthMap) -> VoxelMap:
-        ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
-        return self._new_map(max(2.0 * ground_m, self._resolution_m, 1e-3))
 
     def clear(self) -> None:
         known, self.known = self.known, None

@@ -33,7 +33,7 @@ from recon.pipeline.stages import (
     without_false_surface,
 )
 from recon.pipeline.views import StereoView, ViewSelection, VirtualStereoCamera
-from recon.posegraph.loop_search import LoopSearch
+from recon.posegraph.loop_closure import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.pose_priors import check_prior
 from recon.posegraph.trajectory import Trajectory

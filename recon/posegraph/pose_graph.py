@@ -17,7 +17,7 @@ from recon.posegraph.pose_priors import is_frozen, sound
 from recon.posegraph.records import LOOP_WINDOW, Loop, Node, loops_agree
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
-from recon.posegraph.smoother import MANY_STEPS, STEPS, reversed_motion
+from recon.posegraph.smoother import MANY_STEPS, STEPS
 from recon.posegraph.thinning import GONE_SHARE, moved_loops, thin
 from recon.types import F64, Pose, PosePrior
 
@@ -76,20 +76,16 @@ class PoseGraph:
             self._solve()
         return self.pose(node.seq)
 
-    def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
-        """True when the loop bent the graph; False while it waits for another that agrees.
+    def add_loop(self, loop: Loop) -> bool:
+        """True when the loop, in metres, bent the graph; False while it waits for another that
+        agrees.
 
-        ``T_a_b`` (4, 4) in metres between the cameras of keyframes ``a`` and ``b``, with a
-        ``covariance`` (6, 6) as a left perturbation in a's frame; ``growth`` is what b's depths
-        must be multiplied by to fit a's. A single loop is not accepted: a repeated texture
-        gives perfect matches at the wrong place. A second one nearby must close the same circle.
+        A single loop is not accepted: a repeated texture gives perfect matches at the wrong place.
+        A second one nearby must close the same circle.
         """
-        if a > b:
-            a, b, growth = b, a, 1.0 / growth
-            T_a_b, covariance = reversed_motion(T_a_b, covariance)
-        scale = self.scale(a)
-        ratio = growth * self.scale(b) / scale
-        loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
+        scale = self.scale(loop.a)
+        ratio = loop.ratio * self.scale(loop.b) / scale
+        loop = replace(loop, ratio=ratio).scaled(1.0 / scale)
         if not self._is_possible(loop):
             self._kept_counts["loop impossible"] += 1
             return False
@@ -138,9 +134,6 @@ class PoseGraph:
     def refuted(self) -> dict[int, int]:
         """Steps of vision that attitude and positions contradict: the node after by that before."""
         return self._factors.refuted
-
-    def metric_loops(self) -> list[Loop]:
-        return [loop.scaled(self.scale(loop.a)) for loop in self.loops]
 
     def largest_growth(self) -> float:
         """Log of the largest segment's scale by all factors over its scale by its own readings."""
@@ -272,28 +265,27 @@ class PoseGraph:
         a, b = self._nodes[loop.a], self._nodes[loop.b]
         if a.segment != b.segment:
             return True
-        T = se3.inverse(self._smoother.pose(a.key)) @ self._smoother.pose(b.key)
-        apart = se3.log(se3.inverse(loop.scaled(self.scale(loop.a)).T_a_b) @ T)
+        apart = se3.log(se3.inverse(loop.scaled(self.scale(loop.a)).T_a_b) @ self._step(a, b))
         turned, moved = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
         path_m = self._factors.path_m[b.key] - self._factors.path_m[a.key]
         return moved < SLACK_M + DRIFT * path_m and turned < MAX_TURN_RAD
 
     def _agree(self, one: Loop, other: Loop) -> bool:
         """True when two loops, joined by the track between their ends, close on themselves."""
-        pairs = list(zip(one.ends, other.ends, strict=True))
-        if one.ends == other.ends or not all(self._are_near(*pair) for pair in pairs):
+        (a, b), (a_other, b_other) = ([self._nodes[seq] for seq in o.ends] for o in (one, other))
+        for near, far in ((a, a_other), (b, b_other)):
+            if near.segment != far.segment or abs(near.key - far.key) > LOOP_WINDOW:
+                return False
+        if one.ends == other.ends:
             return False
-        (a, a_other), (b, b_other) = (
-            [self._smoother.pose(self._nodes[seq].key) for seq in pair] for pair in pairs
-        )
-        T_a_a, T_b_b = se3.inverse(a) @ a_other, se3.inverse(b_other) @ b
+        T_a_a, T_b_b = self._step(a, a_other), self._step(b_other, b)
         T_b_b[:3, 3] *= one.ratio * self.scale(one.a) / self.scale(one.b)
         one, other = one.scaled(self.scale(one.a)), other.scaled(self.scale(other.a))
         return loops_agree(one, other, T_a_a, T_b_b)
 
-    def _are_near(self, seq: int, other: int) -> bool:
-        one, two = self._nodes[seq], self._nodes[other]
-        return one.segment == two.segment and abs(one.key - two.key) <= LOOP_WINDOW
+    def _step(self, a: Node, b: Node) -> F64:
+        """(4, 4) T_a_b in metres, as solved last."""
+        return np.asarray(se3.inverse(self._smoother.pose(a.key)) @ self._smoother.pose(b.key))
 
     def _tie(self, loop: Loop) -> bool:
         """True when a loop between segments now places the later one, which no fix does."""

@@ -309,9 +309,3 @@ class Smoother:
             return {}
         at = self._held.at
         return {kind: one.form(one.table.rows, at)[0] for kind, one in self.factors.items()}
-
-
-def reversed_motion(T: F64, covariance: F64) -> tuple[F64, F64]:
-    """T_b_a and its (6, 6) covariance in b's frame, from T_a_b and that in a's frame."""
-    back = se3.inverse(T)
-    return back, se3.left_covariance(back, covariance)

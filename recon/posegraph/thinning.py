@@ -20,7 +20,6 @@ import numpy as np
 from recon import se3
 from recon.posegraph.pose_priors import averaged, without_fixes
 from recon.posegraph.records import Loop, Node
-from recon.posegraph.smoother import reversed_motion
 from recon.types import F64
 
 NEWEST_SHARE = 0.25  # of the newest nodes, which stay: the next motions and loops start from them
@@ -140,9 +139,9 @@ def moved_loop(loop: Loop, marginalised: Mapping[int, Loop]) -> Loop:
         covariance = one.covariance + se3.left_covariance(one.T_a_b, loop.covariance)
         loop = replace(loop, a=one.a, T_a_b=one.T_a_b @ loop.T_a_b, covariance=covariance)
     if (other := marginalised.get(loop.b)) is not None:
-        T, covariance = reversed_motion(other.T_a_b, other.covariance)
+        T = se3.inverse(other.T_a_b)
+        own = se3.in_units(se3.left_covariance(T, other.covariance), loop.ratio)
         T[:3, 3] *= loop.ratio
-        own = se3.in_units(covariance, loop.ratio)
         covariance = loop.covariance + se3.left_covariance(loop.T_a_b, own)
         loop = replace(loop, b=other.a, T_a_b=loop.T_a_b @ T, covariance=covariance)
     return loop

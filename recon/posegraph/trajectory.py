@@ -9,7 +9,8 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.records import Node
+from recon.posegraph.records import Loop, Node
+from recon.posegraph.thinning import moved_loop
 from recon.poses import sigma_m
 from recon.table import Rows, Table
 from recon.types import F64, I64, Bool, Pose
@@ -169,22 +170,21 @@ class Trajectory:
         T[:, :3, 3] += share[:, None] * (other - T)[:, :3, 3]
         return T, scales[before] * (scales[after] / scales[before]) ** share
 
-    def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
-        """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_loop`; ``a`` need not be a node, and
-        then the loop is moved to the node before it, with vision's covariance on the way there;
-        False where that node is of another segment."""
-        if a not in self.graph:
+    def add_loop(self, loop: Loop) -> bool:
+        """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_loop`; its first end need not be a
+        node, and then the loop is moved to the node before it, with vision's covariance on the way
+        there; False where that node is of another segment."""
+        if (a := loop.a) not in self.graph:
             row = self._row[a]
             if self._is_dropped(np.array([row]))[0]:
                 return False  # no node carries it
             i = int(np.searchsorted(self._nodes, row))
             before, after = self.graph.seqs[i - 1], self.graph.node(self.graph.seqs[i])
-            T = self.step_between(before, a)
             share = (row - self._nodes[i - 1]) / after.weight
             step = share * se3.in_units(after.covariance, self.graph.scale(before))
-            covariance = step + se3.left_covariance(T, covariance)
-            a, T_a_b = before, T @ T_a_b
-        return self.graph.add_loop(a, b, T_a_b, covariance, growth)
+            way = Loop(before, a, self.step_between(before, a), step)
+            loop = moved_loop(loop, {a: way})
+        return self.graph.add_loop(loop)
 
     # ---- publishing ----------------------------------------------------------------------------
 

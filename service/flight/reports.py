@@ -114,8 +114,10 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
     """
     if len(graph) < 2:
         return None
-    accepted = graph.metric_loops()
-    step = max(1, -(-len(accepted) // MAX_LOOPS))
+    step = max(1, -(-len(graph.loops) // MAX_LOOPS))
+    accepted = [loop.scaled(graph.scale(loop.a)) for loop in graph.loops[::step]]
+    largest = graph.segments.largest()
+    noise = None if largest is None else largest.noise
     pairs = [
         [*loop.ends, taken]
         for loops, taken in ((graph.loops, True), (graph.pending, False))
@@ -143,20 +145,13 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
                     [float(f"{v:.9g}") for v in pack_motion(loop.T_a_b)],
                     [float(f"{v:.6g}") for v in pack_covariance(loop.covariance)],
                 ]
-                for loop in accepted[::step]
+                for loop in accepted
             ],
         },
         **_constants(graph.constants()),
-        "over_claim": round(_over_claim(graph), 2),
+        "over_claim": 1.0 if noise is None else round(float(noise.over_claim.max()), 2),
         "left_out": {str(k): int(v) for k, v in graph.counts.items()},
     }
-
-
-def _over_claim(graph: PoseGraph) -> float:
-    """How many times further fixes scatter than they claim, 1 at least."""
-    largest = graph.segments.largest()
-    noise = None if largest is None else largest.noise
-    return 1.0 if noise is None else float(noise.over_claim.max())
 
 
 def _constants(found: Constants) -> dict[str, Any]:

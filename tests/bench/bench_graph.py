@@ -13,7 +13,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.records import Node
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
 from recon.types import F64, Pose, PosePrior
@@ -149,7 +149,7 @@ def _keyframe(flight: _Course, i: int, flown: _TimedTrajectory) -> None:
     partner, is_taken, before = _opposite(i), False, time.perf_counter()
     if i % LOOP_EVERY == 0 and partner is not None:
         T_a_b = se3.inverse(flight.truth[partner]) @ flight.truth[i]
-        is_taken = trajectory.add_loop(partner, i, T_a_b, LOOP_SPREAD)
+        is_taken = trajectory.add_loop(Loop(partner, i, T_a_b, LOOP_SPREAD))
     flown.correct()
     flown.newest = trajectory.pose(i)
     now = time.perf_counter()

@@ -69,7 +69,7 @@ def flown() -> Flown:
     before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a > EACH)
     published = trajectory.pose(before + 1)
     segments = graph.node(before).segment, graph.node(after).segment
-    is_looped = trajectory.add_loop(before + 1, COUNT - 1, np.eye(4), SPREAD)
+    is_looped = trajectory.add_loop(Loop(before + 1, COUNT - 1, np.eye(4), SPREAD))
     poses = landed(trajectory, COUNT)
     return Flown(trajectory, most, poses, before + 1, published, is_looped, segments)
 

@@ -16,7 +16,7 @@ from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.records import Node
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 
@@ -61,7 +61,7 @@ def flown(hard: Hard) -> tuple[list[F64], Trajectory]:
         if rng.random() < 0.15 and a in trajectory:
             T = se3.inverse(truth[a]) @ truth[i]
             T[:3, 3] *= trajectory.scale(a) / hard.scale  # it is seen in units of the odometry
-            trajectory.add_loop(a, i, T, LOOP)
+            trajectory.add_loop(Loop(a, i, T, LOOP))
         publish(trajectory, i)
     return truth, trajectory
 

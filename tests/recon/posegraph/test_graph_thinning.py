@@ -44,7 +44,7 @@ def fly(trajectory: Trajectory, count: int = COUNT, first: int = 0) -> None:
         leg, along = divmod(i, LEG)
         if leg and 10 < along < LEG - 10 and i % 4 == 0:
             other = leg * LEG - 1 - along
-            trajectory.add_loop(other, i, se3.inverse(truth[other]) @ truth[i], LOOP)
+            trajectory.add_loop(Loop(other, i, se3.inverse(truth[other]) @ truth[i], LOOP))
         publish(trajectory, i)
 
 
@@ -176,15 +176,15 @@ def test_a_loop_to_an_interpolated_keyframe_is_as_unsure_as_vision_on_the_way_to
         trajectory.add(Node(i, i * 10**9, 0, odom[i], SPREAD * UNITS, priors[i]))
     graph = trajectory.graph
     before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a >= 3)
-    taken: list[tuple[int, F64]] = []
-    monkeypatch.setattr(graph, "add_loop", lambda a, *loop: taken.append((a, loop[2])))
+    taken: list[Loop] = []
+    monkeypatch.setattr(graph, "add_loop", taken.append)
     units = np.outer(*[np.array([1.0] * 3 + [graph.scale(before)] * 3)] * 2)
     for i in (before + 1, before + 2):
-        trajectory.add_loop(i, 15, np.eye(4), np.zeros((6, 6)))
-        node, covariance = taken.pop()
+        trajectory.add_loop(Loop(i, 15, np.eye(4), np.zeros((6, 6))))
+        loop = taken.pop()
         share = (i - before) / (after - before)
-        assert node == before
-        np.testing.assert_allclose(covariance, share * units * graph.node(after).covariance)
+        assert loop.ends == (before, 15)
+        np.testing.assert_allclose(loop.covariance, share * units * graph.node(after).covariance)
 
 
 def test_ends_of_segments_stay() -> None:

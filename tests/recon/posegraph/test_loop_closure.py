@@ -14,11 +14,10 @@ from spied import spied
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
-from recon.posegraph import loop_search
-from recon.posegraph.loop_closure import LoopEnd, candidates, ground_seen, verify
-from recon.posegraph.loop_search import LoopSearch
+from recon.posegraph import loop_closure
+from recon.posegraph.loop_closure import LoopEnd, LoopSearch, candidates, ground_seen, verify
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.records import Node
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, DepthMap, PosePrior
 
@@ -234,7 +233,7 @@ def test_two_verified_loops_close_the_map() -> None:
         guess = se3.inverse(flown[a]) @ flown[b]
         loop = verify(view(poses[a], a), view(poses[b], b), guess)
         assert loop is not None
-        bent.append(graph.add_loop(a, b, *loop[:2]))
+        bent.append(graph.add_loop(Loop(a, b, *loop[:2])))
     assert bent == [False, True]
     closed = graph.poses()
     after = np.linalg.norm(
@@ -276,7 +275,7 @@ def test_a_loop_joins_the_scales_of_its_ends() -> None:
         T_a_b = se3.inverse(poses[a]) @ poses[b]
         T_a_b[:3, 3] *= graph.scale(a)
         growth = graph.scale(a) / graph.scale(b) / DRIFT
-        graph.add_loop(a, b, T_a_b, np.diag([1e-3**2] * 3 + [0.03**2] * 3), growth)
+        graph.add_loop(Loop(a, b, T_a_b, np.diag([1e-3**2] * 3 + [0.03**2] * 3), growth))
     assert abs(graph.scale(55) / graph.scale(4) * DRIFT - 1.0) < 0.003
 
 
@@ -300,7 +299,7 @@ def test_a_segment_that_loops_shrink_tells_by_how_much() -> None:
         T_a_b = se3.inverse(poses[a]) @ poses[b]
         T_a_b[:3, 3] *= graph.scale(a)
         growth = graph.scale(a) / graph.scale(b)
-        graph.add_loop(a, b, T_a_b, np.diag([1e-3**2] * 3 + [0.03**2] * 3), growth)
+        graph.add_loop(Loop(a, b, T_a_b, np.diag([1e-3**2] * 3 + [0.03**2] * 3), growth))
     found = graph.segments.largest()
     assert found is not None and found.to_world.sigma_scale < 0.03
     assert graph.largest_growth() == pytest.approx(np.log(0.9), abs=0.03)
@@ -386,7 +385,7 @@ def test_after_a_loop_the_search_waits_until_the_view_has_moved_on() -> None:
 
 
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, verified = view(A, 1), spied(monkeypatch, loop_search, "verify")
+    seen, verified = view(A, 1), spied(monkeypatch, loop_closure, "verify")
     trajectory = Trajectory()
     search = LoopSearch(trajectory, max_views=6)
     rng = np.random.default_rng(4)

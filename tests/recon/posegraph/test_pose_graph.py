@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recon import parallel, se3
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.records import Node
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.smoother import NO_SCALE, Smoother, State, System
 from recon.posegraph.trajectory import Trajectory
 from recon.similarity import umeyama
@@ -447,10 +447,10 @@ def test_two_loops_that_agree_close_the_circle() -> None:
 
     before = apart()
     assert before > 0.2
-    assert not graph.add_loop(3, 43, true_loop(f, 3, 43), LOOP_COVARIANCE)
+    assert not graph.add_loop(Loop(3, 43, true_loop(f, 3, 43), LOOP_COVARIANCE))
     assert apart() == pytest.approx(before)
-    # Given the other way round, and found a little further on.
-    assert graph.add_loop(46, 6, true_loop(f, 46, 6), LOOP_COVARIANCE)
+    # Found a little further on.
+    assert graph.add_loop(Loop(6, 46, true_loop(f, 6, 46), LOOP_COVARIANCE))
     assert apart() < 0.15
     assert "loop" in graph.pose(43).sources
     assert graph.counts["loop waits"] == 1
@@ -463,7 +463,7 @@ def test_false_loops_never_bend_the_map() -> None:
     rng = np.random.default_rng(1)
     for a, b in ((2, 41), (5, 44), (12, 52), (20, 58), (3, 45)):
         wrong = se3.exp(np.concatenate([rng.normal(size=3) * 0.1, rng.normal(size=3) * 8]))
-        assert not graph.add_loop(a, b, wrong @ true_loop(f, a, b), LOOP_COVARIANCE)
+        assert not graph.add_loop(Loop(a, b, wrong @ true_loop(f, a, b), LOOP_COVARIANCE))
     after = graph.poses()
     np.testing.assert_array_equal(after, before)
 
@@ -588,7 +588,7 @@ def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:
     shrunk = 1.0 / graph.scale(20) * 0.5  # depths of the second stretch, as the first has them
     for a, b in ((3, 15), (5, 18)):
         T_a_b = se3.inverse(f.truth[a]) @ f.truth[b]
-        graph.add_loop(a, b, T_a_b, LOOP_COVARIANCE, shrunk)
+        graph.add_loop(Loop(a, b, T_a_b, LOOP_COVARIANCE, shrunk))
     assert graph.segments[1].is_tied
     poses = graph.poses()
     for i in (12, 18, 23):
@@ -623,7 +623,7 @@ def tied_stretch(
         if i == before + grown:
             for a, b in ((3, before + 3), (5, before + 6)):
                 seen = se3.inverse(f.truth[a]) @ f.truth[b]
-                graph.add_loop(a, b, seen, LOOP_COVARIANCE, graph.scale(a) / graph.scale(b))
+                graph.add_loop(Loop(a, b, seen, LOOP_COVARIANCE, graph.scale(a) / graph.scale(b)))
     assert graph.segments[1].is_tied_by_loop
     return se3.transform(se3.inverse(graph.poses()[4]), graph.poses()[before:, :3, 3])
 
@@ -662,7 +662,7 @@ def test_vision_and_loops_that_contradict_each_other_leave_the_scale_to_the_fixe
         error = se3.exp(10.0 * rng.multivariate_normal(np.zeros(6), spread))
         T = error @ se3.inverse(f.truth[i]) @ f.truth[120 + i]
         T[:3, 3] *= graph.scale(i) / 1.3  # it is seen in units of the odometry
-        graph.add_loop(i, 120 + i, T, spread)
+        graph.add_loop(Loop(i, 120 + i, T, spread))
     graph.solve()
     places, truth = graph.poses()[:, :3, 3], np.array(f.truth)[:, :3, 3]
     found = umeyama(places, truth, is_level=True)
@@ -691,7 +691,7 @@ def test_a_loop_that_vision_cannot_have_drifted_is_refused() -> None:
     row = np.eye(4)
     row[0, 3] = 30.0  # the next but one row of a field looks the same
     for a, b in ((3, 43), (5, 45), (7, 47)):
-        assert not graph.add_loop(a, b, true_loop(f, a, b) @ row, LOOP_COVARIANCE)
+        assert not graph.add_loop(Loop(a, b, true_loop(f, a, b) @ row, LOOP_COVARIANCE))
     assert graph.counts["loop impossible"] == 3
     np.testing.assert_array_equal(graph.poses()[44], before[44])
 
@@ -700,8 +700,8 @@ def test_a_loop_that_vision_cannot_have_drifted_is_refused() -> None:
 def test_solved_at_once_it_is_the_same_and_tells_its_residuals() -> None:
     f = flight(80)
     graph, _ = fly(f, every_s=1000)  # so long that readings err independently
-    graph.add_loop(3, 60, true_loop(f, 3, 60), LOOP_COVARIANCE)
-    graph.add_loop(5, 58, true_loop(f, 5, 58), LOOP_COVARIANCE)
+    graph.add_loop(Loop(3, 60, true_loop(f, 3, 60), LOOP_COVARIANCE))
+    graph.add_loop(Loop(5, 58, true_loop(f, 5, 58), LOOP_COVARIANCE))
     graph.solve()
     once = graph.poses()
     graph.rebuild()

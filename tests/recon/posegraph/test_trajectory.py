@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.records import Node
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.trajectory import REPOSE_M, REPOSE_SIGMAS, Trajectory
 from recon.poses import carried, sigma_m
 from recon.types import F64, DepthMap, Keyframe, Pose, PosePrior
@@ -62,7 +62,7 @@ def flown(truth: list[F64], chain: list[F64], height: float = HEIGHT_M) -> Traje
 def close_loops(trajectory: Trajectory, truth: list[F64]) -> list[bool]:
     pairs = ((2, 2 * LEG - 3), (5, 2 * LEG - 6), (9, 2 * LEG - 10))
     return [
-        trajectory.graph.add_loop(10 * a, 10 * b, se3.inverse(truth[a]) @ truth[b], LOOP)
+        trajectory.graph.add_loop(Loop(10 * a, 10 * b, se3.inverse(truth[a]) @ truth[b], LOOP))
         for a, b in pairs
     ]
 

@@ -12,7 +12,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.records import Node
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
 from recon.types import PosePrior
@@ -181,11 +181,14 @@ def test_figures_of_a_graph_are_its_own() -> None:
 
 
 def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
+    T_a_b = se3.exp(np.array([0.1, 0.0, 0.3, 4.0, 5.0, 6.0]))
+    loop = Loop(3, 40, T_a_b, np.diag([1e-6] * 3 + [1e-3] * 3))
+
     class Fixed:
         """A graph of known records."""
 
         entered = 2
-        loops, pending = PoseGraph().loops, PoseGraph().pending
+        loops, pending = [loop.scaled(0.5)], PoseGraph().pending
         counts: dict[str, int] = {"loop waits": 1}  # noqa: RUF012
 
         def __len__(self) -> int:
@@ -194,18 +197,14 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
         def residuals(self) -> dict[str, Any]:
             return {}
 
-        def metric_loops(self) -> list[Any]:
-            return [self]
+        def scale(self, seq: int) -> float:
+            return 2.0
 
         def constants(self) -> Constants:
             turn, sigma = np.radians([1.6, -1.2, 0.0]), np.radians([0.2, 0.2, 2.0])
             return Constants(turn, sigma, -0.71234, 0.2)
 
         segments = Segments()
-
-        a, b = 3, 40
-        T_a_b = se3.exp(np.array([0.1, 0.0, 0.3, 4.0, 5.0, 6.0]))
-        covariance = np.diag([1e-6] * 3 + [1e-3] * 3)
 
     stand_in: Any = Fixed()
     figures = graph_figures(stand_in)
@@ -220,5 +219,5 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
     assert "+1.60 ± 0.20, -1.20 ± 0.20" in rows["boresight about right, down, ahead"]
     assert rows["altitude raised to the receiver's"] == "-0.71 m"
     found = unpack_motion(motion)
-    assert found is not None and np.allclose(found, Fixed.T_a_b, atol=1e-7)
-    assert np.allclose(unpack_covariance(upper), Fixed.covariance, rtol=1e-5)
+    assert found is not None and np.allclose(found, T_a_b, atol=1e-7)
+    assert np.allclose(unpack_covariance(upper), loop.covariance, rtol=1e-5)
