@@ -5,14 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from recon.tracking.matching import consensus
 from recon.tracking.sift_features import features, mutual
 from recon.types import F64, U8, Bool
 
 MOST, WIDTH_PX = 3000, 1600  # features that are matched, and the width at which they are sought
 MAX_SHARE = 0.02  # of the height; rows further apart are another pair, or not rectified
-MIN_MATCHES, MIN_CONSENT = 60, 0.5  # that agree, and their share of those within reach
+MIN_MATCHES, MIN_CONSENT = 60, 0.5  # features, and the share of them of the disparities
 RANGE_PERCENTILES = 2.0, 98.0
-GATE_SIGMAS, FLOOR_PX, ROUNDS = 3.0, 0.25, 8
+TOLERANCE_PX = 0.5  # by which places of features err
 MIN_OFF_PX = 0.5  # rows that are less apart stay: matching bridges half a pixel
 
 
@@ -49,18 +50,13 @@ def rows_apart(
     agrees on how.
     """
     near = _within(apart[:, 0], disparities)
-    there, lower = there[near], -apart[near, 1]
-    if len(lower) < MIN_MATCHES:
+    if np.count_nonzero(near) < 2 * MIN_MATCHES:  # two in five agree
         return None
-    terms = np.column_stack([np.ones(len(there)), there])
-    fit = np.array([np.median(lower), 0.0, 0.0])
-    for _ in range(ROUNDS):
-        off = np.abs(lower - terms @ fit)
-        good = off < GATE_SIGMAS * max(1.4826 * float(np.median(off)), FLOOR_PX)
-        if good.sum() < max(MIN_MATCHES, MIN_CONSENT * len(lower)):
-            return None
-        fit = np.linalg.lstsq(terms[good], lower[good], rcond=None)[0]
-    h, w = size
+    lower = np.column_stack([-apart[:, 1], np.zeros(len(apart))])
+    found = consensus(there, lower, near, TOLERANCE_PX)
+    if found is None:
+        return None
+    fit, (h, w) = found[:, 0], size
     corners = np.array([[1, u, v] for u in (0, w) for v in (0, h)]) @ fit
     return fit if np.abs(corners).max() > MIN_OFF_PX else None
 

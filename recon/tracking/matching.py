@@ -267,18 +267,17 @@ class Search:
         return uv, score, contrast_a, contrast_b
 
 
-def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 | None:
-    """(N, 2) affine trend of ``residual`` over ``uv`` seen by most good points, else None."""
+def consensus(uv: F64, moves: F64, good: Bool, tolerance_px: float) -> F64 | None:
+    """(3, 2) how ``moves`` (N, 2) change over ``uv`` (N, 2), as a row of 1, u, v times it, seen by
+    most good points; else None."""
     if np.count_nonzero(good) < 12:
         return None
-    x, y = uv[good], residual[good]
+    x, y = uv[good], moves[good]
     trend = np.empty((3, 2))
     affine_trend(x, y, np.median(y, axis=0), tolerance_px, trend)
-    everywhere = trend[0] + uv @ (trend[1:] / 1000.0)
-    agree = np.hypot(*(y - everywhere[good]).T) < 2 * tolerance_px
-    if np.count_nonzero(agree) < max(12, 0.4 * len(y)):
-        return None
-    return np.asarray(everywhere)
+    trend[1:] /= 1000.0
+    agree = np.hypot(*(y - trend[0] - x @ trend[1:]).T) < 2 * tolerance_px
+    return trend if np.count_nonzero(agree) >= max(12, 0.4 * len(y)) else None
 
 
 def start_level(radius_px: float, levels: int) -> tuple[int, int]:
@@ -350,9 +349,10 @@ def match_led(
         start = uv_b_predicted[some]
         found = match(pyramid_a, uv_a[some], pyramid_b, start, radius_px, warp[some], config)
         led[some], good[some] = found.uv_px - start, found.ok
-        trend = _consensus(uv_a.astype(np.float64), led, good, STEADY_PX)
+        trend = consensus(uv_a.astype(np.float64), led, good, STEADY_PX)
         if trend is not None:
-            return match(pyramid_a, uv_a, pyramid_b, uv_b_predicted + trend, 0.0, warp, config)
+            there = uv_b_predicted + (trend[0] + uv_a @ trend[1:])
+            return match(pyramid_a, uv_a, pyramid_b, there, 0.0, warp, config)
     return match(pyramid_a, uv_a, pyramid_b, uv_b_predicted, radius_px, warp, config)
 
 
@@ -391,10 +391,10 @@ def _follow_others(
 ) -> tuple[F64, Bool]:  # fmt: skip
     """Places, and which of them take part, after points without an answer got one from the trend.
     So did those further than ``stray_px`` from it: relief moves points, but not that far."""
-    trend = _consensus(a, uv - predicted, active, tolerance_px)
+    trend = consensus(a, uv - predicted, active, tolerance_px)
     if trend is None:
         return uv, active
-    expected = predicted + trend
+    expected = predicted + (trend[0] + a @ trend[1:])
     own = active & (np.linalg.norm(uv - expected, axis=1) <= stray_px)
     return np.where(own[:, None], uv, expected), everyone.copy()
 
