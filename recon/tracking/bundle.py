@@ -28,6 +28,8 @@ from recon import se3
 from recon.small_matrices import invert_3x3, solve_symmetric
 from recon.types import F64, I64, Bool
 
+HUBER_PX = 1.0  # longer errors lose weight: corners err by some tenths, mismatches by more
+
 CELL_ROWS = 4
 """Cells whose errors count as independent: so many strips with as many cells each. Larger ones hold
 more of what an encoder moves together; fewer do not show how they scatter."""
@@ -35,13 +37,12 @@ more of what an encoder moves together; fewer do not show how they scatter."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleResult:
-    """Refined poses and points; ``converged`` is False when no step lowered the cost."""
+    """Refined poses and points."""
 
     T_camera_world: F64  # (C, 4, 4)
     points_m: F64  # (N, 3) world
     residual_px: F64  # (M,) length of the reprojection error, inf behind the camera
     joint: F64  # (C, C, 6, 6) covariance, left perturbations of T_camera_world; zero where fixed
-    converged: bool
 
     def step_covariance(self, a: int, b: int) -> F64:
         """(6, 6) of the motion from camera ``a`` to ``b``, left perturbation of T_b_a."""
@@ -206,9 +207,9 @@ def _normal_equations(
 def _adjust(
     T: F64, X: F64, cam: I64, start: I64, uv: F64, k: F64, huber: float, slot: I64, n_free: int,
     iterations: int, first: I64,
-) -> tuple[F64, F64, F64, F64, F64, bool]:  # fmt: skip
-    """Poses, points, lengths of the errors, by runs of points from ``first`` (R + 1,) on their
-    (R, 6F, 6F) reduced systems and (R, 6F) right sides, and whether the cost was lowered."""
+) -> tuple[F64, F64, F64, F64, F64]:  # fmt: skip
+    """Poses, points, lengths of the errors, and by runs of points from ``first`` (R + 1,) on their
+    (R, 6F, 6F) reduced systems and (R, 6F) right sides."""
     M, N = cam.size, X.shape[0]
     pt = np.empty(M, np.int64)
     for p in range(N):
@@ -223,7 +224,6 @@ def _adjust(
     dc = np.zeros((6 * n_free, 1))
     cost = _cost(T, X, cam, pt, uv, k, huber, res)
     damping = 1e-4
-    improved = False
     for _ in range(iterations):
         _normal_equations(
             T, X, cam, start, uv, k, huber, slot, n_free, damping, S, g, Hpp_inv, bp, W
@@ -253,7 +253,6 @@ def _adjust(
         if cost_new < cost:
             gain = (cost - cost_new) / max(cost, 1e-12)
             T, X, cost = T_new, X_new, cost_new
-            improved = True
             damping = max(damping * 0.2, 1e-9)
             if gain < 1e-5:
                 break
@@ -269,7 +268,7 @@ def _adjust(
             T, X[a:b], cam, start[a : b + 1], uv, k, huber, slot, n_free, 0.0, runs[c], sides[c],
             Hpp_inv[a:b], bp[a:b], W,
         )  # fmt: skip
-    return T, X, res, runs, sides, improved
+    return T, X, res, runs, sides
 
 
 def adjust(
@@ -281,7 +280,7 @@ def adjust(
     K: F64,
     free: Bool,
     *,
-    huber_px: float = 1.0,
+    huber_px: float = HUBER_PX,
     sigma_px: float | None = 0.3,
     iterations: int = 8,
 ) -> BundleResult:
@@ -308,7 +307,7 @@ def adjust(
     start = np.searchsorted(number[point_index[order]], np.arange(N + 1)).astype(np.int64)
     slot = np.where(free, np.cumsum(free) - 1, -1).astype(np.int64)
     k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-    T, moved, residual, cells, sides, improved = _adjust(
+    T, moved, residual, cells, sides = _adjust(
         np.ascontiguousarray(T_camera_world, dtype=np.float64),
         np.ascontiguousarray(points_m[by_place], dtype=np.float64),
         np.ascontiguousarray(camera_index[order], dtype=np.int64),
@@ -331,7 +330,7 @@ def adjust(
     back[order] = residual
     points = np.empty_like(moved)
     points[by_place] = moved
-    return BundleResult(T, points, back, joint, bool(improved))
+    return BundleResult(T, points, back, joint)
 
 
 def _by_place(T_camera_world: F64, points_m: F64) -> I64:

@@ -13,10 +13,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from recon.tracking.bundle import BundleResult, linearise_all
+from recon.tracking.bundle import HUBER_PX, BundleResult, linearise_all
 from recon.types import F64, I64
 
-HUBER_PX = 1.0  # longer errors lose weight: corners err by some tenths, mismatches by more
 CELLS = 4  # rows and columns of cells of the landmarks
 
 

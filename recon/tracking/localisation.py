@@ -114,11 +114,10 @@ class Localiser:
             heeds_turn: a pose that turns otherwise than telemetry is false.
         """
         reason, best = "no match", None
-        least = MIN_TRACKS
         most = None if low_frame_rate else TRACKED_LANDMARKS
         for key, T_camera_odom, share, by_features in self.starts(new, keyframes, motion, lost):
             left = keyframes[-2] if len(keyframes) > 1 and key is keyframes[-1] else None
-            found = self.pose_from(key, new, T_camera_odom, share, least, most, left)
+            found = self.pose_from(key, new, T_camera_odom, share, MIN_TRACKS, most, left)
             if isinstance(found, str):
                 reason = found
                 continue
@@ -414,7 +413,8 @@ class Localiser:
             if found[1].sum() > ok.sum():
                 uv, ok = found
             if ok.sum() > 0.5 * len(first.uv):
-                self._drift = prediction.common_affine(first.uv[ok], uv[ok])
+                A = robust_geometry.affine(first.uv[ok], uv[ok], 8.0)
+                self._drift = np.eye(3) if A is None else np.vstack([A, [0.0, 0.0, 1.0]])
                 break
         return uv, ok
 

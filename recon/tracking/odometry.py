@@ -244,8 +244,10 @@ class Odometry:
         self._lost = 0
         least = FIRST_STEP * self._base_to_height
         moved = prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
+        # A camera that circles a place keeps it in the middle: it moves, but the image does not.
+        off = 0.0 if R_b_a is not None else prediction.beyond_turn(first.uv[ok], uv[ok], self.K)
         view = None
-        if moved >= least or (R_b_a is None and self._is_no_turn(first.uv[ok], uv[ok])):
+        if moved >= least or self.K[0, 0] * off > 2.0 * two_view.MAX_ERROR_PX:
             inverse_depth = 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0
             view = self._localiser.motion_since(
                 first, new, uv, ok, inverse_depth, R_b_a, FIRST_TURN_RAD,
@@ -266,12 +268,6 @@ class Odometry:
         self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
         return [self._accept_two_views(new, (first, second @ first.T_camera_odom, uv, ok))]
-
-    def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
-        """True where no turn of the camera explains matched pixels (N, 2). A camera that circles a
-        place keeps it in the middle: it moves, but the image does not."""
-        off_px = float(self.K[0, 0]) * prediction.beyond_turn(uv_a, uv_b, self.K)
-        return off_px > 2.0 * two_view.MAX_ERROR_PX
 
     def _place_early(self, first: Frame) -> None:
         """Poses of the frames after the first; they say how its rows moved."""

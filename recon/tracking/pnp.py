@@ -43,12 +43,6 @@ class PnpResult:
     T_camera_points: F64  # (4, 4) m
     covariance: F64  # (6, 6) left perturbation in the camera frame: rotation rad, translation m
     inliers: Bool  # (N,)
-    rms_px: float  # of both coordinates together, inliers
-
-    @property
-    def inlier_share(self) -> float:
-        """Share of the points given that the pose explains."""
-        return float(np.mean(self.inliers))
 
 
 STEPS = 10  # maximum number of Gauss-Newton steps
@@ -61,13 +55,12 @@ def solve(
     prior_T_camera_points: F64 | None = None,
     threshold_px: float = THRESHOLD_PX,
     min_inliers: int = MIN_INLIERS,
-    draws: int = DRAWS,
 ) -> PnpResult | None:
     """The pose that projects ``points_m`` (N, 3) to ``uv_px`` (N, 2), or None without trust.
 
     ``K`` (3, 3) is of the undistorted image. ``prior_T_camera_points`` (4, 4) competes with
     EPnP's answer as a start, and a result that turns far away from it must explain most of
-    the points. RANSAC draws up to ``draws`` times. Points or pixels that are not finite are
+    the points. Points or pixels that are not finite are
     outliers. None: too few inliers, too loose a fit, or points so placed that the position
     stays open.
     """
@@ -81,7 +74,7 @@ def solve(
     shift = se3.compose(np.eye(3), middle)
     prior = None if prior_T_camera_points is None else prior_T_camera_points @ shift
     k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-    starts = _starts(local, pixels, K, k, prior, threshold_px, draws)
+    starts = _starts(local, pixels, K, k, prior, threshold_px)
     T = _best(starts, local, pixels, k, threshold_px, min_inliers)
     if T is None:
         return None
@@ -94,7 +87,7 @@ def solve(
 
 
 def _starts(
-    points: F64, uv: F64, K: F64, k: F64, prior: F64 | None, threshold_px: float, draws: int
+    points: F64, uv: F64, K: F64, k: F64, prior: F64 | None, threshold_px: float
 ) -> list[F64]:
     """Poses to start from: the prior where it explains most points to a few pixels, else also
     EPnP's on the largest consensus of RANSAC. Eq. (6), (7)."""
@@ -102,7 +95,7 @@ def _starts(
         near = _errors(prior, points, uv, k) <= 3.0 * threshold_px
         if np.mean(near) >= PRIOR_SHARE:
             return [prior]
-    drawn = robust_geometry.consensus_pose(points, uv, K, threshold_px, draws, CONFIDENCE)
+    drawn = robust_geometry.consensus_pose(points, uv, K, threshold_px, DRAWS, CONFIDENCE)
     return [T for T in (prior, drawn) if T is not None]
 
 
@@ -211,7 +204,7 @@ def _judge(
     depth = points[inliers] @ T[2, :3] + T[2, 3]
     if not sigma <= MAX_SIGMA_SHARE * float(np.median(depth)):
         return None
-    return PnpResult(T, covariance, inliers, float(np.sqrt(np.mean(error**2))))
+    return PnpResult(T, covariance, inliers)
 
 
 def _inverse(H: F64) -> F64 | None:

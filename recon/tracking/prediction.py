@@ -50,15 +50,6 @@ def _robust_plane(P: F64) -> F64:  # pragma: no cover - compiled
     return q[:, 0]
 
 
-def common_affine(uv: F64, there: F64) -> F64:
-    """(3, 3) affine motion of pixels ``uv`` (N, 2) to ``there`` (N, 2), robust."""
-    A = robust_geometry.affine(uv, there, 8.0)
-    H = np.eye(3)
-    if A is not None:
-        H[:2] = A
-    return H
-
-
 def on_landmarks(
     key: Frame, K: F64, size_px: tuple[int, int], T_camera_odom: F64
 ) -> tuple[F64, F64, Bool]:

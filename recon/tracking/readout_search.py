@@ -14,6 +14,7 @@ import numpy as np
 
 from recon.rolling_shutter import RowClock
 from recon.tracking import bundle
+from recon.tracking.bundle import HUBER_PX
 from recon.tracking.frame import Frame
 from recon.tracking.keyframe_window import observations
 from recon.types import F64
@@ -31,7 +32,6 @@ FLOOR_S = 1e-4  # sigma of the row motion's own errors
 BENT = 0.1  # of the way from the readout in use, by which the rows' motion was bent: a sigma
 MIN_WINDOWS = 2  # fewer make nothing sure
 GLOBAL_S = 5e-4  # a readout and a sigma below it show a global shutter
-HUBER_PX = 1.0  # longer errors lose weight: corners err by some tenths, mismatches by more
 USUAL_S = 0.02  # sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms
 
 

@@ -8,6 +8,7 @@ function of OpenCV on measured points elsewhere.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import cv2
@@ -26,8 +27,11 @@ RELATIVE_POSE_PX = 1.0  # from its epipolar line, below which a match supports a
 _T = TypeVar("_T")
 
 
-def attempt(call: Callable[[], _T]) -> _T | None:
-    """The result of ``call``; None when OpenCV rejects its input."""
+def attempt(call: Callable[[], _T], *points: Array, least: int = 3) -> _T | None:
+    """The result of ``call``; None when OpenCV rejects its input, and for points (N, 2 or 3) that
+    span no plane or are fewer than ``least``."""
+    if any(len(one) < least for one in points) or not span_a_plane(*points):
+        return None
     try:
         return call()
     except (cv2.error, np.linalg.LinAlgError):
@@ -54,9 +58,8 @@ def _spans_a_plane(points: F64) -> bool:
 def pose_from_points(points_m: F64, uv_px: F64, K: F64, flags: int) -> F64 | None:
     """(4, 4) T_camera_points of (N, 3) points at (N, 2) pixels; N is 4 or more. ``flags`` is one of
     OpenCV's SOLVEPNP methods, such as EPnP."""
-    if len(points_m) < 4 or not span_a_plane(points_m, uv_px):
-        return None
-    found = attempt(lambda: cv2.solvePnP(points_m, uv_px, K, None, flags=flags))
+    solve = partial(cv2.solvePnP, points_m, uv_px, K, None, flags=flags)
+    found = attempt(solve, points_m, uv_px, least=4)
     return None if found is None or not found[0] else _motion(found[1], found[2])
 
 
@@ -64,30 +67,18 @@ def consensus_pose(
     points_m: F64, uv_px: F64, K: F64, threshold_px: float, iterations: int, confidence: float
 ) -> F64 | None:
     """(4, 4) T_camera_points by EPnP on the largest consensus of RANSAC."""
-    if len(points_m) < 5 or not span_a_plane(points_m, uv_px):
-        return None
-    found = attempt(
-        lambda: cv2.solvePnPRansac(
-            points_m,
-            uv_px,
-            K,
-            None,
-            flags=cv2.SOLVEPNP_EPNP,
-            reprojectionError=threshold_px,
-            iterationsCount=iterations,
-            confidence=confidence,
-        )
-    )
+    solve = partial(
+        cv2.solvePnPRansac, points_m, uv_px, K, None, flags=cv2.SOLVEPNP_EPNP,
+        reprojectionError=threshold_px, iterationsCount=iterations, confidence=confidence,
+    )  # fmt: skip
+    found = attempt(solve, points_m, uv_px, least=5)
     return None if found is None or not found[0] else _motion(found[1], found[2])
 
 
 def _essential(uv_a: F64, uv_b: F64, K: F64, threshold_px: float) -> tuple[Array, Array] | None:
     """The essential matrix of (N, 2) matched pixels, and (N, 1) which of them agree with it."""
-    if len(uv_a) < 6 or not span_a_plane(uv_a, uv_b):
-        return None
-    E, mask = attempt(
-        lambda: cv2.findEssentialMat(uv_a, uv_b, K, cv2.USAC_MAGSAC, 0.9999, threshold_px)
-    ) or (None, None)
+    find = partial(cv2.findEssentialMat, uv_a, uv_b, K, cv2.USAC_MAGSAC, 0.9999, threshold_px)
+    E, mask = attempt(find, uv_a, uv_b, least=6) or (None, None)
     return None if E is None or mask is None or E.shape != (3, 3) else (E, mask)
 
 
@@ -113,9 +104,8 @@ def on_epipolar_lines(uv_a: F64, uv_b: F64, K: F64, threshold_px: float) -> Bool
 
 def homography(uv_a: F64, uv_b: F64, threshold_px: float) -> tuple[F64, Bool] | None:
     """((3, 3) H with uv_b ~ H uv_a, (N,) inliers) of (N, 2) matched pixels; H is invertible."""
-    if len(uv_a) < 4 or not span_a_plane(uv_a, uv_b):
-        return None
-    found = attempt(lambda: cv2.findHomography(uv_a, uv_b, cv2.USAC_MAGSAC, threshold_px))
+    find = partial(cv2.findHomography, uv_a, uv_b, cv2.USAC_MAGSAC, threshold_px)
+    found = attempt(find, uv_a, uv_b, least=4)
     if found is None or found[0] is None or not _is_finite(found[0]):
         return None
     H, mask = found
@@ -152,10 +142,8 @@ def homography_motions(H: F64, K: F64) -> list[tuple[F64, F64]]:
 
 def affine(a: F64, b: F64, threshold: float, is_similarity: bool = False) -> F64 | None:
     """(2, 3) affine map, or similarity, of (N, 2) points ``a`` to ``b`` by RANSAC."""
-    if not span_a_plane(a, b):
-        return None
     estimate: Any = cv2.estimateAffinePartial2D if is_similarity else cv2.estimateAffine2D
-    found = attempt(lambda: estimate(a, b, ransacReprojThreshold=threshold))
+    found = attempt(lambda: estimate(a, b, ransacReprojThreshold=threshold), a, b)
     if found is None or found[0] is None or not _is_finite(found[0]):
         return None
     return np.asarray(found[0], np.float64)

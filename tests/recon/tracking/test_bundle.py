@@ -46,7 +46,6 @@ def test_exact_pixels_bring_the_poses_back() -> None:
     free = np.arange(len(T)) >= 2
     start = X + rng.normal(0, 1.0, X.shape)
     result = bundle.adjust(disturbed(T, rng), start, cam, pt, uv, K, free, iterations=40)
-    assert result.converged
     np.testing.assert_allclose(result.T_camera_world, T, atol=1e-4)
     assert np.median(result.residual_px) < 1e-3
 

@@ -243,7 +243,7 @@ class TwoStarts(Localiser):
     ) -> Located:
         is_off = share == OFF
         explained = np.arange(90) < (30 if is_off else 80)
-        solved = PnpResult(T_camera_odom, np.eye(6), explained, 0.5)
+        solved = PnpResult(T_camera_odom, np.eye(6), explained)
         return Located(key, solved, np.zeros((90, 2)), explained | is_off, 1.0, share)
 
 
