@@ -78,9 +78,6 @@ class FramePoses:
         sigma_m = np.hypot(sigma_m, np.linalg.norm(way_m))
         return pose_at(frame.T_odom_camera, place_m + way_m, sigma_m, sources)
 
-    def _has_fix(self, segment: int) -> bool:
-        return segment in self._fallbacks and "gnss" in self._fallbacks[segment][3]
-
     def pose(self, frame: Frame, fallback: Pose) -> Pose:
         """A frame in the world, carried by the view at or before it where it can. A segment too
         short to be aligned has no scale and no heading: its frames stay at their fixes."""
@@ -89,7 +86,8 @@ class FramePoses:
             return fallback
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self._map.trajectory.pose(view.seq)
-        if self._has_fix(frame.segment) and not known.is_aligned:
+        at_fix = self._fallbacks.get(frame.segment)
+        if at_fix is not None and "gnss" in at_fix[3] and not known.is_aligned:
             return fallback
         pose = carried(known, se3.inverse(view.T_odom_camera) @ frame.T_odom_camera)
         after = self._map.graph.refuted.get(view.seq) if self._newest is None else None

@@ -49,8 +49,7 @@ from recon.types import U8, Array, Camera, DepthMap, Keyframe, PointCloud, Pose,
 @dataclass(frozen=True, slots=True)
 class MapperConfig:
     # A view each so many metres along the track, or frames; by base to height where both are 0.
-    spacing_m: float = 0.0
-    spacing_frames: int = 0
+    spacing: tuple[float, int] = (0.0, 0)
     pairs: int = 4  # partners of a view, at most
     base_to_height: float = 0.1  # motion between the odometry's keyframes over the distance
     seeks_readout: bool = False  # the shutter's readout is a start, to be found by the images
@@ -180,9 +179,7 @@ class Mapper:
             config.seeks_readout,
             config.base_to_height,
         )
-        selection = ViewSelection(
-            config.spacing_m, config.spacing_frames, config.pairs, all_known=known is not None
-        )
+        selection = ViewSelection(config.spacing, config.pairs, all_known=known is not None)
         self._waiting = Counter[str]()  # frames since a segment's first one, by reason
         self.views = VirtualStereoCamera(
             selection, self.odometry, self.undistort.undistorter, self.refused
@@ -395,17 +392,17 @@ class Mapper:
 
     # ---- in flight ---------------------------------------------------------------------
 
-    def set_spacing(self, metres: float, frames: int) -> None:
+    def set_spacing(self, spacing: tuple[float, int]) -> None:
         """Space views otherwise from the next frame on, as :class:`MapperConfig` says."""
-        self.views.selection.spacing = metres, frames
-        self.stereo.set_min_base_to_height(self.views.selection.min_base_to_height)
+        self.views.selection.spacing = spacing
+        self.stereo.change(min_base_to_height=self.views.selection.min_base_to_height)
 
     def set_effort(self, pairs: int, stereo_width_px: int, upsample: bool) -> None:
         """Apply these from the next view on."""
         self.views.selection.max_partners = pairs
-        self.stereo.set_effort(stereo_width_px, upsample)
+        self.stereo.change(width_px=stereo_width_px, guided=upsample)
         if self._first_stereo is not None:
-            self._first_stereo.set_effort(stereo_width_px // COARSER, upsample=False)
+            self._first_stereo.change(width_px=stereo_width_px // COARSER)
 
     def take_next(self) -> None:
         """Make the next frame with a pose a view, whatever the baseline asks for."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -76,7 +77,10 @@ class Undistort:
     def __call__(self, frame: Frame) -> Frame:
         """Raises ValueError when the image is not of the camera model's size."""
         with self._timing("undistort"):
-            image = _resized(frame.image, self.camera.size_px)
+            image = frame.image
+            if image.shape[1] > self.camera.size_px[0]:
+                size = self.camera.size_px
+                image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
             gray = self.undistorter.image(gray)
             small, size = gray, self.tracking_camera.size_px
@@ -167,13 +171,9 @@ class DenseStereo:
         if depth is not None:
             self._relief_m = plane_relief(depth, self._relief_m)
 
-    def set_min_base_to_height(self, minimum: float) -> None:
-        """Accept baselines as short as ``minimum`` of the distance."""
-        self._config = replace(self._config, min_base_to_height=minimum)
-
-    def set_effort(self, width_px: int, upsample: bool) -> None:
-        """Reconstruct at another width, with or without upsampling, from the next view on."""
-        self._config = replace(self._config, width_px=width_px, guided=upsample)
+    def change(self, **parameters: Any) -> None:
+        """Set parameters of :class:`VirtualStereoConfig` from the next view on."""
+        self._config = replace(self._config, **parameters)
 
     def _rectified(
         self, view: StereoView, known: Collection[int], config: VirtualStereoConfig
@@ -247,14 +247,6 @@ def keyframe_of(
     and ``sigma_m`` (h, w) are in units of the odometry."""
     metric = replace(depth, sigma_m=sigma_m).scaled(pose.scale, pose.T_world_camera)
     return Keyframe(view.seq, view.frame.time_ns, metric, bgr, pose, fresh)
-
-
-def _resized(image: U8, size_px: tuple[int, int]) -> U8:
-    """A larger image at the undistorted camera's size; any other as it is."""
-    W, H = size_px
-    if image.shape[:2] == (H, W) or image.shape[1] <= W:
-        return image
-    return np.asarray(cv2.resize(image, (W, H), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _within_width(camera: Camera, width_px: int) -> Camera:

@@ -81,21 +81,17 @@ class ViewSelection:
     """Selects views from tracked frames and remembers the last few as partners."""
 
     def __init__(
-        self,
-        spacing_m: float = 0.0,
-        spacing_frames: int = 0,
-        partners: int = 4,
-        all_known: bool = False,
+        self, spacing: tuple[float, int] = (0.0, 0), partners: int = 4, all_known: bool = False
     ) -> None:
-        """Views are ``spacing_m`` apart, or ``spacing_frames``; by base to height where both are
-        0. Then at most ``partners`` of the last :data:`KEPT` views pair up with one of them.
+        """Views are so many metres apart, or frames; by base to height where both are 0. Then at
+        most ``partners`` of the last :data:`KEPT` views pair up with one of them.
 
         ``all_known``: the poses are final, and views wait for those on their far side.
 
         With more partners than the neighbouring views can be, tracked frames between them
         become partners too.
         """
-        self.spacing = spacing_m, spacing_frames  # set at once: a frame may come at any time
+        self.spacing = spacing  # set at once: a frame may come at any time
         self.max_partners = partners
         self.takes_next = False  # the next frame with a pose, whatever the baseline asks for
         self._all_known = all_known

@@ -44,12 +44,10 @@ def spacing_of(scan: ScanConfig) -> tuple[float, int]:
 def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperConfig:
     """The mapper's parameters by the configuration; ``live`` for a flight that can be followed."""
     compute, scan, link = config.compute, config.scan, config.datalink
-    spacing_m, spacing_frames = spacing_of(scan)
     is_sent = live and bool(link.connect or link.listen)
     is_sent = is_sent and 125.0 * link.budget_kbit_s * link.share >= FIRST_BYTES_S
     return MapperConfig(
-        spacing_m=spacing_m,
-        spacing_frames=spacing_frames,
+        spacing=spacing_of(scan),
         pairs=compute.pairs,
         base_to_height=scan.base_to_height,
         seeks_readout=seeks_readout(camera, config.camera),

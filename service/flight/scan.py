@@ -156,7 +156,7 @@ class Scan:
     def configure(self, config: Config, compute: ComputeConfig) -> None:
         """Apply the keys of ``config`` that change in flight, with the ``compute`` of its load."""
         self.check.set_camera(config.camera)
-        self.mapper.set_spacing(*spacing_of(config.scan))  # from the next frame on
+        self.mapper.set_spacing(spacing_of(config.scan))  # from the next frame on
         self.mapper.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
 
     def take_photo(self) -> None:
@@ -281,8 +281,9 @@ class Scan:
             "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
         }
         extra["assumed"] = self._assumed()
-        extra["sigma_focal"] = round(max(self.inputs.sigma_focal, abs(self._focal_off())), 4)
-        extra["focal_by_images"] = self._focal_by_images()
+        off, by_images = self._focal_by_images()
+        extra["sigma_focal"] = round(max(self.inputs.sigma_focal, abs(off)), 4)
+        extra["focal_by_images"] = by_images
         extra["camera_readout"] = self._readout()
         extra["motion_blur"] = self.motion_blur
         shutter = self.found_shutter()
@@ -307,23 +308,16 @@ class Scan:
         camera = with_shutter(self.inputs.camera, self.inputs.config.camera)
         return camera.shutter.reading(search.readout_s)
 
-    def _focal_off(self) -> float:
-        """Share by which the images contradict the focal length; 0 where they do not."""
+    def _focal_by_images(self) -> tuple[float, dict[str, Any] | None]:
+        """Share by which the images contradict the focal length, 0 where they do not; and the
+        change that they ask for, None where they show none."""
         found = self.mapper.odometry.focal.estimate
         if found is None:
-            return 0.0
-        change, sigma, _ = found
-        sigma = math.hypot(sigma, self.inputs.sigma_focal)
-        is_off = abs(change) > max(MIN_FOCAL_OFF, FOCAL_OFF_SIGMAS * sigma)
-        return change if is_off else 0.0
-
-    def _focal_by_images(self) -> dict[str, Any] | None:
-        """The change of the focal length that the images ask for; None where they show none."""
-        found = self.mapper.odometry.focal.estimate
-        if found is None:
-            return None
+            return 0.0, None
         change, sigma, windows = found
-        return {"change": round(change, 4), "sigma": round(sigma, 4), "windows": windows}
+        limit = FOCAL_OFF_SIGMAS * math.hypot(sigma, self.inputs.sigma_focal)
+        off = change if abs(change) > max(MIN_FOCAL_OFF, limit) else 0.0
+        return off, {"change": round(change, 4), "sigma": round(sigma, 4), "windows": windows}
 
     def _readout(self) -> dict[str, Any] | None:
         """The readout by the images; None where it was not sought or does not show."""
@@ -373,7 +367,7 @@ class Scan:
                 f"the images show a readout of {1e3 * shutter.readout_s:.1f} ms, "
                 f"{shutter.direction}: set camera.readout_ms and camera.readout_direction"
             )
-        off = self._focal_off()
+        off, _ = self._focal_by_images()
         if off:
             out.append(
                 f"the images show a focal length that is {abs(off):.1%} "

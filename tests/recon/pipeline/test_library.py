@@ -125,8 +125,8 @@ def test_no_frame_comes_between_the_two_numbers_of_a_spacing() -> None:
             if self is mapper.views.selection:
                 steps.append(self.frames_per_step)
 
-    mapper.views.selection = Watched(2.0)
-    mapper.set_spacing(0.0, 5)
+    mapper.views.selection = Watched((2.0, 0))
+    mapper.set_spacing((0.0, 5))
     assert steps == [np.inf]  # no moment at which base to height decides
 
 

@@ -114,7 +114,7 @@ def test_two_views_alone_confirm_nothing() -> None:
     assert first is not None and not views.ready(first) and not views.confirmed(first)
     offer(views, 2, 10.0, "keyframe")
     assert views.ready(first) and views.confirmed(first)
-    fixed = ViewSelection(spacing_m=2.0)
+    fixed = ViewSelection((2.0, 0))
     left = offer(fixed, 0, 0.0, "started")
     offer(fixed, 1, 2.5, "tracked")
     assert left is not None and fixed.ready(left) and fixed.confirmed(left)
@@ -125,13 +125,13 @@ def test_two_views_alone_confirm_nothing() -> None:
     [("2/10", [0, 10, 20, 30]), ("3/10", [0, 5, 10]), ("1/5", [0, 5, 10]), ("6/10", [0, 2, 4])],
 )
 def test_the_papers_notation_takes_every_so_many_frames(baseline: str, seqs: list[int]) -> None:
-    views = ViewSelection(*spacing_of(ScanConfig(baseline=baseline)))
+    views = ViewSelection(spacing_of(ScanConfig(baseline=baseline)))
     taken = [i for i in range(31) if offer(views, i, 0.1 * i, "keyframe" if i == 0 else "tracked")]
     assert taken[: len(seqs)] == seqs
 
 
 def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
-    views = ViewSelection(spacing_m=2.0)
+    views = ViewSelection((2.0, 0))
     taken = [i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")]
     assert taken == [0, 4, 8, 12, 16]
     views.spacing = 1.0, 0
@@ -178,15 +178,15 @@ def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None
     last = frame(28, 14.0)
     assert views.end_segment(last) and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
     assert not views.end_segment(None) and len(views.partners(last)) == 4
-    fixed = ViewSelection(spacing_m=2.0)
+    fixed = ViewSelection((2.0, 0))
     for i in range(3):
         offer(fixed, i, 2.5 * i, "tracked" if i else "started")
     assert not fixed.end_segment(frame(3, 6.5))
 
 
 def test_all_frames_count_where_the_operator_chose_the_baseline_or_wants_the_next_one() -> None:
-    assert ViewSelection(spacing_m=2.0).frames_per_step == np.inf
-    assert ViewSelection(spacing_frames=10).frames_per_step == np.inf
+    assert ViewSelection((2.0, 0)).frames_per_step == np.inf
+    assert ViewSelection((0.0, 10)).frames_per_step == np.inf
     views = ViewSelection()
     views.takes_next = True
     assert views.frames_per_step == np.inf
