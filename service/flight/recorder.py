@@ -221,8 +221,7 @@ class Recorder:
             "image_bytes": self.image_bytes,
             "distance_m": round(self.distance_m, 2),
             "georeference": self._rig.georeference,
-            "scale": self._scale(),
-            "lean_sigma_deg": self._lean_sigma_deg(),
+            **self._of_largest(),
             "stage_ms": {k: round(v, 2) for k, v in self.pipeline.stopwatch.mean_ms().items()},
             "refusals": dict(self.mapper.refusals()),
             "drops": self._drops(),
@@ -235,26 +234,23 @@ class Recorder:
         late = {"newer views came faster": dropped} if dropped else {}
         return dict(self.mapper.refusals()) | late
 
-    def _scale(self) -> dict[str, Any]:
-        """Source of the metric scale, its relative sigma, and what contradicts it: of the largest
-        segment."""
+    def _of_largest(self) -> dict[str, Any]:
+        """Of the largest segment the source of the metric scale, its relative sigma and what
+        contradicts it; and the sigma of what is level, None where attitudes show it."""
         graph = self._graph
         found = graph.segments.largest()
         if found is None:
-            return {"from": FIRST_TELEMETRY, "sigma": None}
+            return {"scale": {"from": FIRST_TELEMETRY, "sigma": None}, "lean_sigma_deg": None}
         by = ", ".join(found.to_world.sources)
         if not {"altitude", "gnss"} & set(found.to_world.sources):
             is_known = found.to_world.sigma_scale < GUESSED_SHARE / 2
             by = "velocity" if is_known else "an assumed height"
         out = {"from": by, "sigma": round(sigma_of_scale(graph), 4)}
         ratio = gnss_over_heights(graph)
-        return out if ratio is None else out | {"gnss_over_heights": round(ratio, 3)}
-
-    def _lean_sigma_deg(self) -> float | None:
-        """Sigma of what is level, of the largest segment; None where attitudes show it."""
-        found = self._graph.segments.largest()
-        sigma = None if found is None else found.to_world.sigma_lean_rad
-        return None if sigma is None else round(math.degrees(sigma), 2)
+        if ratio is not None:
+            out["gnss_over_heights"] = round(ratio, 3)
+        lean_deg = _degrees(found.to_world.sigma_lean_rad)
+        return {"scale": out, "lean_sigma_deg": None if lean_deg is None else round(lean_deg, 2)}
 
     def _write_origin(self) -> None:
         """The origin goes into the header once the first position is known."""
@@ -324,7 +320,9 @@ class Recorder:
             dt = (time_ns - self._last[0]) * 1e-9
             step = float(np.linalg.norm(T[:3, 3] - self._last[1][:3, 3]))
             self.distance_m += step
-            speed, turn = step / dt, _heading_change(self._last[1], T) / dt
+            R = T[:3, :3] @ self._last[1][:3, :3].T
+            # About the vertical, positive to the right (clockwise).
+            speed, turn = step / dt, -math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]) / dt
         self._last = (time_ns, T)
         self.speed_m_s, self.turn_rate_rad_s = speed, turn
         lat = lon = alt = None
@@ -351,23 +349,9 @@ class Recorder:
         )
 
 
-def _heading_change(T_a: F64, T_b: F64) -> float:
-    """Turn about the vertical from pose a to b, rad, positive to the right (clockwise)."""
-    R = T_b[:3, :3] @ T_a[:3, :3].T
-    return -math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
-
-
 log = logging.getLogger(__name__)
 
 TAGS_FILE = "telemetry.csv"
-SOURCES = ("attitude", "gimbal", "gnss", "agl")
-SIGMAS = ("attitude_deg", "yaw_deg", "gimbal_deg", "horizontal_m", "vertical_m", "agl_m")
-COLUMNS = (
-    "time_unix_s",
-    "sources",
-    *(f"age_{name}_ms" for name in SOURCES),
-    *(f"sigma_{name}" for name in SIGMAS),
-)
 HEIGHTS = ("rangefinder", "terrain", "relative")
 
 
@@ -378,7 +362,7 @@ class FrameTags:
         self._file: TextIO | None = None
         try:
             self._file = path.open("w", encoding="ascii", buffering=1 << 16)
-            self._file.write(",".join(COLUMNS) + "\n")
+            self._file.write(",".join(_row(0, VehicleState(0))) + "\n")
         except OSError as error:
             self._give_up(error)
 
@@ -386,7 +370,7 @@ class FrameTags:
         if self._file is None or state is None:
             return
         try:
-            self._file.write(_line(time_unix_ns, state))
+            self._file.write(",".join(_row(time_unix_ns, state).values()) + "\n")
         except OSError as error:
             self._give_up(error)
 
@@ -403,25 +387,23 @@ class FrameTags:
         self._file = None
 
 
-def _line(time_unix_ns: int, state: VehicleState) -> str:
+def _row(time_unix_ns: int, state: VehicleState) -> dict[str, str]:
+    """The cells of a frame's line by their columns."""
     age = state.age_ms
-    ages = (
-        age.get("attitude"),
-        age.get("gimbal"),
-        age.get("gnss"),
-        next((age[name] for name in HEIGHTS if name in age), None),
-    )
-    sigmas = (
-        _degrees(state.sigma_attitude_rad),
-        _degrees(state.sigma_yaw_rad),
-        _degrees(state.sigma_gimbal_rad),
-        state.sigma_h_m,
-        state.sigma_v_m,
-        state.sigma_agl_m,
-    )
-    cells = [seconds_text(time_unix_ns), " ".join(state.sources)]
-    cells += [cell(one, 1) for one in ages] + [cell(one, 3) for one in sigmas]
-    return ",".join(cells) + "\n"
+    return {
+        "time_unix_s": seconds_text(time_unix_ns),
+        "sources": " ".join(state.sources),
+        "age_attitude_ms": cell(age.get("attitude"), 1),
+        "age_gimbal_ms": cell(age.get("gimbal"), 1),
+        "age_gnss_ms": cell(age.get("gnss"), 1),
+        "age_agl_ms": cell(next((age[name] for name in HEIGHTS if name in age), None), 1),
+        "sigma_attitude_deg": cell(_degrees(state.sigma_attitude_rad), 3),
+        "sigma_yaw_deg": cell(_degrees(state.sigma_yaw_rad), 3),
+        "sigma_gimbal_deg": cell(_degrees(state.sigma_gimbal_rad), 3),
+        "sigma_horizontal_m": cell(state.sigma_h_m, 3),
+        "sigma_vertical_m": cell(state.sigma_v_m, 3),
+        "sigma_agl_m": cell(state.sigma_agl_m, 3),
+    }
 
 
 def _degrees(value: float | None) -> float | None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mavlink.telemetry.samples import VehicleState
-from service.flight.recorder import COLUMNS, TAGS_FILE, FrameTags
+from service.flight.recorder import TAGS_FILE, FrameTags
 
 STATE = VehicleState(
     0,
@@ -31,7 +31,7 @@ def test_each_frame_has_a_line_and_what_is_unknown_stays_empty(tmp_path: Path) -
     tags.write(1_700_000_002_000_000_000, STATE)  # closed
     tags.close()
     lines = (tmp_path / TAGS_FILE).read_text().splitlines()
-    assert lines[0] == ",".join(COLUMNS)
+    assert lines[0].startswith("time_unix_s,sources,age_attitude_ms,age_gimbal_ms,age_gnss_ms,")
     (row,) = csv.DictReader(lines)
     assert row["time_unix_s"] == "1700000000.123456789"
     assert row["sources"] == "attitude gimbal gnss terrain"
