@@ -369,8 +369,9 @@ class Scan:
             )
         off, _ = self._focal_by_images()
         if off:
+            by = f"{abs(off):.1%}" if abs(off) < 0.5 else "more than half"
             out.append(
-                f"the images show a focal length that is {abs(off):.1%} "
+                f"the images show a focal length that is {by} "
                 f"{'longer' if off > 0 else 'shorter'} than the camera model's: calibrate the "
                 "camera as it records"
             )

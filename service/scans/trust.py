@@ -26,6 +26,8 @@ MAX_LEAN_SIGMA_DEG = 2.0
 """Above this sigma of what is level, slopes are in doubt: cameras that look 15 degrees ahead make
 level ground lean by 10."""
 
+HALF = 0.5  # of a focal length: a change beyond it is found, but not its size
+
 MIN_LENS_SIGMA, MAX_LENS_SIGMA = 0.01, 0.1
 """Sigma of a focal length above which heights are in doubt, and above which the shape is; so, too,
 where positions and heights give scales that differ by more, as after a zoom."""
@@ -212,9 +214,10 @@ def is_another_latency(found_ms: float, sigma_ms: float, applied_ms: float) -> b
 
 
 def _uncertain(sigma_focal: float) -> str:
+    share = f"{100.0 * sigma_focal:.0f} %" if sigma_focal < HALF else "more than half"
     return (
-        f"the focal length is uncertain by {100.0 * sigma_focal:.0f} % (1 sigma): heights err by "
-        "as much of the distance; calibrate the camera"
+        f"the focal length is uncertain by {share} (1 sigma): heights err by as much of the "
+        "distance; calibrate the camera"
     )
 
 

@@ -45,6 +45,7 @@ SURE: dict[str, Any] = {
             "focal length is uncertain by 4 % (1 sigma)",
         ),
         ({"sigma_focal": 0.2}, "gnss", "doubtful", "focal length is uncertain by 20 % (1 sigma)"),
+        ({"sigma_focal": 1.77}, "gnss", "doubtful", "uncertain by more than half (1 sigma)"),
         ({"scale": {"gnss_over_heights": 0.95}}, "gnss", "georeferenced", "5 % smaller"),
         ({"scale": {"gnss_over_heights": 0.8}}, "gnss", "doubtful", "25 % smaller"),
         ({"assumed": ["height", "view"]}, "none", "relative", "assumed height"),
