@@ -335,6 +335,24 @@ def test_sets_that_arrive_late_lie_at_their_own_times_and_date_the_video() -> No
     assert log.last_ns == found[-1] == stamps_ns[-1] - log.start_unix_ns
 
 
+@pytest.mark.parametrize("spoilt", ["own time", "packet's time"])
+def test_one_damaged_time_costs_its_set_alone(spoilt: str) -> None:
+    """Not the date of the video, and the own times of all others."""
+    packets, first = [], cheyenne()[0]
+    began_us = int.from_bytes(first[HEAD + 2 : HEAD + 10], "big")
+    for k in range(40):
+        is_bad = k == 20
+        own_us = began_us + 1_000_000 * k + (1 << 52) * (is_bad and spoilt == "own time")
+        data = first[: HEAD + 2] + own_us.to_bytes(8, "big") + first[HEAD + 10 : -2]
+        summed = sum(data[0::2]) * 256 + sum(data[1::2])
+        data += (summed & 0xFFFF).to_bytes(2, "big")
+        late_ns = 900 * SECOND_NS * (is_bad and spoilt == "packet's time")
+        packets.append((k * SECOND_NS + late_ns, 0, data))
+    log = klv.of_packets(HERE, packets, HistoryConfig())
+    assert log.start_unix_ns == pytest.approx(1000 * began_us, abs=1000)
+    assert (log.first_ns, log.last_ns) == (0, 39 * SECOND_NS)
+
+
 def stream(path: Path, sets: Sequence[bytes], before: bytes = b"") -> None:
     """MPEG-TS of ten black images and a set after each second one; the sets' packets have no time,
     as in a private stream (MISB ST 1402, asynchronous). Of ``before`` is a stream of its own."""

@@ -64,6 +64,8 @@ def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> Tel
 MAX_APART_NS = 2_000_000_000
 """What a sample's own clock may differ from its packet's time, beyond a constant."""
 
+MIN_SOUND = 0.95  # share of the samples whose own clock is not damaged
+
 
 class Track:
     """Samples at the times of their packets, and at those of their own clock."""
@@ -82,18 +84,26 @@ class Track:
     def fill(self, history: VehicleHistory) -> int:
         """Add the samples to a history by their own clock; that clock at time 0 of the packets.
 
-        Packets come late by what was in the way, so the offset is the median one. Where a sample
-        states no time, or one that is far off, the packets' times count, and 0 is returned.
+        Packets come late by what was in the way, so the offset is the median one. A few samples
+        that state no time, or one that is far off, are damaged and left out; where they are more,
+        the packets' times count, and 0 is returned.
         """
-        times_ns, start_ns = self._times_ns, 0
-        own_ns = [own for own in self._own_ns if own is not None]
-        if own_ns and len(own_ns) == len(times_ns):
-            offset_ns = median_low(own - at for at, own in zip(times_ns, own_ns, strict=True))
-            own_ns = [own - offset_ns for own in own_ns]
-            apart_ns = max(abs(a - b) for a, b in zip(own_ns, times_ns, strict=True))
-            if apart_ns < MAX_APART_NS:
-                times_ns, start_ns = own_ns, offset_ns
-        for time_ns, samples in zip(times_ns, self.samples, strict=True):
+        known = [
+            (own_ns, time_ns, samples)
+            for own_ns, time_ns, samples in zip(
+                self._own_ns, self._times_ns, self.samples, strict=True
+            )
+            if own_ns is not None
+        ]
+        start_ns = median_low(own_ns - time_ns for own_ns, time_ns, _ in known) if known else 0
+        placed = [
+            (own_ns - start_ns, samples)
+            for own_ns, time_ns, samples in known
+            if abs(own_ns - start_ns - time_ns) < MAX_APART_NS
+        ]
+        if len(placed) < MIN_SOUND * len(self.samples):
+            start_ns, placed = 0, list(zip(self._times_ns, self.samples, strict=True))
+        for time_ns, samples in placed:
             for sample in samples:
                 history.add(sample, time_ns)
         return start_ns
