@@ -404,7 +404,8 @@ class ImagesSource(CameraSource):
                 f"{lack}; ordered by {by}, one per second "
                 "(images:DIR?interval_s=2 orders them by name and sets it)"
             )
-            return [int(n) * SECOND_NS for n in np.argsort(order)], unix[order[0]]
+            first = unix[order[0]] or tags[order[0]].local_ns
+            return [int(n) * SECOND_NS for n in np.argsort(order)], first
         step_ns = round((interval_s or 1.0) * SECOND_NS)
         return [i * step_ns for i in range(len(tags))], unix[0]
 

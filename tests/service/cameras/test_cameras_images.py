@@ -153,9 +153,13 @@ def test_stills_of_one_second_are_spread_over_it(tmp_path: Path, sub: str | None
     assert [f.time_ns for f in open_camera(str(tmp_path))] == [0, 5 * 10**8, 10**9, 15 * 10**8]
 
 
-def test_one_time_that_a_tool_wrote_to_all_stills_is_none(tmp_path: Path) -> None:
+@pytest.mark.parametrize("offset", ["+00:00", None])
+def test_one_time_that_a_tool_wrote_to_all_stills_is_none(
+    tmp_path: Path, offset: str | None
+) -> None:
+    """It dates them."""
     for i in range(12):
-        write_still(tmp_path / f"{i}.jpg", "2024:06:01 12:00:00", offset="+00:00")
+        write_still(tmp_path / f"{i}.jpg", "2024:06:01 12:00:00", offset=offset)
     source = open_camera(str(tmp_path))
     assert [f.time_ns for f in source] == [i * 10**9 for i in range(12)]
     assert source.epoch_unix_ns == NOON_UTC_NS
