@@ -624,13 +624,19 @@ def test_erase(ends: Ends) -> None:
     assert results(ends.pass_time(4.0), 526)[-1] == BUSY  # nothing says that it is disarmed
     ends.arm()
     assert ends.command(526, 100, 1, 1, 0, 2) == [BUSY]
-    ends.disarm()
-    assert ends.command(526, 100, 1, 1, 1) == [RUNNING]
-    ends.pass_time(0.5)
-    assert results(ends.arm(False), 526) == [ACCEPTED]
-    assert ends.control.asked == ["start_scan", "stop_scan", "erase_scans"]
-    status = ends.companion.camera.message(262, 0)
-    assert isinstance(status, dialect.MAVLink_message) and status.image_count == 0
+    for reset, images in ((0, 1), (1, 0)):
+        ends.disarm()
+        assert ends.command(526, 100, 1, 1, reset) == [RUNNING]
+        ends.pass_time(0.5)
+        assert results(ends.arm(False), 526) == [ACCEPTED]
+        status = ends.companion.camera.message(262, 0)
+        assert isinstance(status, dialect.MAVLink_message) and status.image_count == images
+    assert ends.control.asked == ["start_scan", "stop_scan", "erase_scans", "erase_scans"]
+
+
+def test_the_mode_is_video_in_which_photos_are_taken(ends: Ends) -> None:
+    assert ends.command(530, 100, 0, 1) == [ACCEPTED]
+    assert ends.command(530, 100, 0, 0) == ends.command(530, 100, 0, NAN) == [DENIED]
 
 
 def test_reset_of_the_settings(ends: Ends) -> None:
