@@ -6,6 +6,9 @@ whole image; only other images of the same ground show it, each where the map ha
 odometry drifts by until a loop corrects it is no error of the map. What they disagree by is the
 square root of the adjustment's variance factor (Mikhail and Ackermann, Observations and Least
 Squares, 1976), and sigmas are multiplied by it.
+
+The same images refute surface in free space: where stereo has one pair alone, nothing contradicts a
+false match of it.
 """
 
 from __future__ import annotations
@@ -17,11 +20,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
+from recon.camera_model import rays
+from recon.mapping.free_space import seen_through
 from recon.mapping.voxel_map import sampled, shared
-from recon.types import F32, F64, Bool, DepthMap
+from recon.types import F32, F64, Bool, DepthMap, PointCloud
 
 NORMAL_MEDIAN = 0.6745  # median of the absolute value of a normal variable of unit sigma
 IMAGES = 32  # number of images that are kept
+WIDTH_PX = 320  # of those that show what is free space, at most; at half their size or less
 MIN_COMMON = 60  # minimum number of samples that two images share
 
 NEIGHBOURS_CORRELATION = (0.55, 0.28)
@@ -32,6 +38,8 @@ They share frames. Measured on simulated flights at three widths
 
 MIN_FACTOR, MAX_FACTOR = 0.75, 30.0
 """Errors that all images share show in no difference; a larger difference is other ground."""
+
+MAX_REFUTED = 0.01  # of an image; more of it shows that its pose is false, not its depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,10 +59,12 @@ class Disagreement:
         """``placed`` as :meth:`recon.posegraph.trajectory.Trajectory.similarities`."""
         self._placed = placed
         self._earlier: deque[_Samples] = deque(maxlen=IMAGES)
+        self._shown: deque[tuple[int, DepthMap]] = deque(maxlen=IMAGES)
 
     def forget(self) -> None:
         """Forget earlier images: the new ones are of another segment."""
         self._earlier.clear()
+        self._shown.clear()
 
     def take(self, seq: int, depth: DepthMap) -> float:
         """The factor that the new image's sigmas are to be multiplied by; it is remembered.
@@ -77,6 +87,39 @@ class Disagreement:
             return 1.0
         factor = float(np.sqrt(np.mean(np.square(ratios))))
         return float(np.clip(factor, MIN_FACTOR, MAX_FACTOR))
+
+    def refuted(self, seq: int, depth: DepthMap) -> Bool:
+        """(h, w) pixels that one pair alone saw, where more pairs of the last images see through
+        that place; the image is remembered. ``depth`` as in :meth:`take`, with its final sigma."""
+        depth = replace(depth, T_world_camera=np.eye(4))
+        *there, here = self._placed([*(one for one, _ in self._shown), seq])
+        views = [
+            replace(one, T_world_camera=np.linalg.solve(here, T))
+            for (_, one), T in zip(self._shown, there, strict=True)
+        ]
+        self._shown.append((seq, _coarser(depth)))
+        alone = depth.views == 1
+        v, u = np.nonzero(alone)
+        places = rays(depth.K, np.column_stack([u, v]).astype(np.float64))
+        places *= depth.depth_m[alone, None]
+        cloud = PointCloud(
+            places.astype(np.float32), np.zeros((len(u), 3), np.uint8), depth.sigma_m[alone],
+            depth.views[alone],
+        )  # fmt: skip
+        false = seen_through(cloud, [depth, *views], window_px=1)
+        out = np.zeros(alone.shape, np.bool_)
+        out[alone] = false & (np.count_nonzero(false) <= MAX_REFUTED * depth.depth_m.size)
+        return out
+
+
+def _coarser(depth: DepthMap) -> DepthMap:
+    """Every second pixel of a depth, or fewer: a window of 3x3 of them is 5x5 of its own."""
+    step = max(2, -(-depth.depth_m.shape[1] // WIDTH_PX))
+    every = np.s_[::step, ::step]
+    return replace(
+        depth, depth_m=depth.depth_m[every].copy(), sigma_m=depth.sigma_m[every].copy(),
+        views=depth.views[every].copy(), K=depth.K / [[step], [step], [1.0]],
+    )  # fmt: skip
 
 
 def _apart(depth: DepthMap, one: _Samples, T_here_there: F64) -> float | None:

@@ -68,7 +68,7 @@ class Tiles:
         reach = middle @ planes[:, :3].T + half @ np.abs(planes[:, :3]).T + planes[:, 3]
         return np.flatnonzero((reach >= 0.0).all(axis=1) & ~self.is_decided)
 
-    def look(self, kernel: Any, depth: DepthMap, reached: I64, *arrays: Array) -> None:
+    def look(self, kernel: Any, depth: DepthMap, reached: I64, *arrays: Array | int) -> None:
         """Run a compiled ``kernel`` on the tiles that are ``reached``, with a keyframe's depth,
         sigma and camera, and with ``arrays`` of its own."""
         if len(reached):
@@ -121,7 +121,7 @@ def _planes(depth: DepthMap, slack_m: float) -> F64 | None:
 
 AGREES_SIGMAS = 2.5
 BEHIND_SIGMAS = 4.0
-WINDOW_PX = 2  # surface must be behind the point at every known pixel this far around it
+WINDOW_PX = 2  # surface must be behind the point at every known pixel this far around it, usually
 
 KNOWN_SHARE = 0.5
 
@@ -142,7 +142,7 @@ def spread(views: Sequence[T]) -> list[T]:
     return [views[i] for i in np.argsort(turns, kind="stable").argsort(kind="stable")]
 
 
-def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
+def seen_through(cloud: PointCloud, views: Iterable[DepthMap], window_px: int = WINDOW_PX) -> Bool:
     """(N,) points that more stereo pairs see through than see.
 
     A keyframe counts with the number of pairs that agree at its pixel. Points that no
@@ -156,7 +156,8 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     for depth in views:
         slack_m = AGREES_SIGMAS * (largest_m + float(np.nanmax(depth.sigma_m, initial=0.0)))
         pairs = np.ascontiguousarray(depth.views, np.uint8)
-        tiles.look(_vote, depth, tiles.in_view(depth, slack_m), sigma, pairs, seers, asked)
+        reached = tiles.in_view(depth, slack_m)
+        tiles.look(_vote, depth, reached, sigma, pairs, window_px, seers, asked)
     out: Bool = np.zeros(len(cloud), np.bool_)
     out[tiles.order] = seers < 0
     return out
@@ -228,7 +229,7 @@ def _look_above(
 @njit(cache=True, nogil=True)
 def _vote(
     begin: int, end: int, tiles: I64, first: I64, xyz: F32, is_decided: Bool, depth: F32,
-    depth_sigma: F32, K: F64, T: F64, sigma: F32, views: U8, seers: I16, asked: U8,
+    depth_sigma: F32, K: F64, T: F64, sigma: F32, views: U8, window: int, seers: I16, asked: U8,
 ) -> None:  # fmt: skip
     """Add one keyframe's votes on the points of ``tiles[begin:end]`` to ``seers``. A vote is the
     pairs that see less the pairs that see through; ``T`` is T_camera_world."""
@@ -242,16 +243,16 @@ def _vote(
             x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2])
             at, down, cz = pixel_of(K, T, x, y, z)
             u, v = int(np.floor(at + 0.5)), int(np.floor(down + 0.5))
-            if not (WINDOW_PX <= u < w - WINDOW_PX and WINDOW_PX <= v < h - WINDOW_PX):
+            if not (window <= u < w - window and window <= v < h - window):
                 continue
             asked[p] += 1
-            seers[p] += _judgement(u, v, cz, float(sigma[p]), depth, depth_sigma, views)
+            seers[p] += _judgement(u, v, cz, float(sigma[p]), depth, depth_sigma, views, window)
         is_decided[tile] = left == 0
 
 
 @njit(cache=True, nogil=True)
 def _judgement(
-    u: int, v: int, cz: float, sigma: float, depth: F32, depth_sigma: F32, views: U8
+    u: int, v: int, cz: float, sigma: float, depth: F32, depth_sigma: F32, views: U8, window: int
 ) -> int:
     """The pairs that see a point at pixel (u, v) and depth ``cz``; negative: see through it."""
     here = depth[v, u]
@@ -261,8 +262,8 @@ def _judgement(
     most = 1
     agrees = False
     behind = 0
-    for dv in range(-WINDOW_PX, WINDOW_PX + 1):
-        for du in range(-WINDOW_PX, WINDOW_PX + 1):
+    for dv in range(-window, window + 1):
+        for du in range(-window, window + 1):
             d = depth[v + dv, u + du]
             if not d > 0.0:
                 continue
@@ -275,6 +276,6 @@ def _judgement(
                 most = max(most, int(views[v + dv, u + du]))
     if agrees:
         return most
-    if known >= KNOWN_SHARE * (2 * WINDOW_PX + 1) ** 2 and behind == known:
+    if known >= KNOWN_SHARE * (2 * window + 1) ** 2 and behind == known:
         return -most
     return 0

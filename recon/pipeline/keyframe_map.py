@@ -22,6 +22,7 @@ from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
+from recon.stereo.reprojection import known_where
 from recon.types import F32, F64, Bool, DepthMap, Keyframe, Pose, Verdict
 
 FARTHEST_M = 1e6  # maximum distance from the scan's origin
@@ -159,9 +160,10 @@ class SurfaceMap:
 
     def __call__(
         self, seq: int, segment: int, depth: DepthMap, rows_share: F32, T_odom_camera: F64
-    ) -> tuple[F32, Bool]:
-        """((h, w) sigma, which holds disagreement of views and an unknown readout, not what all
-        points share; (h, w) surface that is new or better).
+    ) -> tuple[DepthMap, Bool]:
+        """(The depth in the odometry, without what earlier views refute, its sigma with
+        disagreement of views and an unknown readout, not what all points share; (h, w) surface that
+        is new or better).
 
         ``rows_share`` (n, m), all over the image, is the sigma of depth over depth by the rows'
         motion.
@@ -172,6 +174,7 @@ class SurfaceMap:
         in_odom = self._in_odom(depth, rows_share, T_odom_camera)
         factor = np.float32(self._disagreement.take(seq, in_odom))
         in_odom = replace(in_odom, sigma_m=in_odom.sigma_m * factor)
+        in_odom = known_where(in_odom, ~self._disagreement.refuted(seq, in_odom))
         known = self.known
         if known is None:
             ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
@@ -179,14 +182,14 @@ class SurfaceMap:
             self.known = known
         fresh = known.fresh(in_odom)
         known.insert(in_odom, fresh)
-        return in_odom.sigma_m, fresh
+        return in_odom, fresh
 
-    def peek(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> tuple[F32, Bool]:
+    def peek(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> tuple[DepthMap, Bool]:
         """As :meth:`__call__`, of a depth that is not remembered and shows no disagreement."""
         in_odom = self._in_odom(depth, rows_share, T_odom_camera)
         known = self.known  # another thread may clear it meanwhile
         fresh = np.isfinite(depth.depth_m) if known is None else known.fresh(in_odom)
-        return in_odom.sigma_m, fresh
+        return in_odom, fresh
 
     def _in_odom(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> DepthMap:
         """The depth at its place, its sigma widened by what its rows limit."""

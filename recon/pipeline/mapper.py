@@ -314,10 +314,9 @@ class Mapper:
             return pose, (changed,)
         with self._timing("map"):  # what is new
             T_odom = self.keyframes.trajectory.odom_pose(view.seq)
-            sigma_m, fresh = self.surface(view.seq, view.segment, depth, view.rows_share, T_odom)
-            in_odom = replace(depth, T_world_camera=T_odom)
-            bgr = self.exposure(view.segment, in_odom, bgr)  # as bright as the map
-        keyframe = keyframe_of(view, depth, bgr, sigma_m, fresh, pose)
+            depth, fresh = self.surface(view.seq, view.segment, depth, view.rows_share, T_odom)
+            bgr = self.exposure(view.segment, depth, bgr)  # as bright as the map
+        keyframe = keyframe_of(view, depth, bgr, fresh, pose)
         if self.debug is not None:
             metric = keyframe.depth
             self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
@@ -345,8 +344,8 @@ class Mapper:
         if self.keyframes.graph.segments[view.segment].agreement < 0:
             return None, ()
         T_odom, pose = predicted
-        sigma_m, fresh = self.surface.peek(depth, view.rows_share, T_odom)
-        first = keyframe_of(view, depth, self.exposure.level(bgr), sigma_m, fresh, pose)
+        depth, fresh = self.surface.peek(depth, view.rows_share, T_odom)
+        first = keyframe_of(view, depth, self.exposure.level(bgr), fresh, pose)
         return None, (KeyframeReady(first, is_first_depth=True),)
 
     def drain(self) -> tuple[Event, ...]:

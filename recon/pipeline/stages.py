@@ -24,7 +24,6 @@ from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief
 from recon.tracking.frame import NO_IMAGE, Frame
 from recon.tracking.matching import build_pyramid
 from recon.types import (
-    F32,
     F64,
     U8,
     Array,
@@ -240,12 +239,10 @@ def without_false_surface(view: StereoView, depth: DepthMap, bgr: U8) -> DepthMa
     return plausible(drop_edges(depth, bgr), view.frame.prior)
 
 
-def keyframe_of(
-    view: StereoView, depth: DepthMap, bgr: U8, sigma_m: F32, fresh: Bool, pose: Pose
-) -> Keyframe:
-    """The pipeline's output: metric depth in colour, its pose, and the new part of it. ``depth``
-    and ``sigma_m`` (h, w) are in units of the odometry."""
-    metric = replace(depth, sigma_m=sigma_m).scaled(pose.scale, pose.T_world_camera)
+def keyframe_of(view: StereoView, depth: DepthMap, bgr: U8, fresh: Bool, pose: Pose) -> Keyframe:
+    """The pipeline's output: metric depth in colour, its pose, and the new part of it. ``depth`` is
+    in units of the odometry."""
+    metric = depth.scaled(pose.scale, pose.T_world_camera)
     return Keyframe(view.seq, view.frame.time_ns, metric, bgr, pose, fresh)
 
 

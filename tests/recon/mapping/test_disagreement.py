@@ -8,7 +8,7 @@ from scipy.linalg import toeplitz
 
 from recon import se3
 from recon.mapping.disagreement import MIN_FACTOR, NEIGHBOURS_CORRELATION, Disagreement
-from recon.types import F64, DepthMap
+from recon.types import F64, Bool, DepthMap
 
 SIZE = (160, 120)
 K = np.array([[150.0, 0.0, 79.5], [0.0, 150.0, 59.5], [0.0, 0.0, 1.0]])
@@ -134,3 +134,41 @@ def test_other_ground_and_what_was_forgotten_say_nothing() -> None:
     found.found.forget()
     assert found.take(_seen(PLACES[0], 0.1, 4, noise=9.0)) == 1.0
     assert found.take(_seen(PLACES[0], 0.1, 5, noise=3.0)) > 3.0
+
+
+TOWER = np.s_[20:30, 30:42]
+
+
+def _with_tower(T: F64, seed: int, pairs: int) -> DepthMap:
+    """Level ground, and on it an object 8 m high that so many pairs saw."""
+    image = _seen(T, 0.1, seed)
+    image.depth_m[TOWER], image.views[TOWER] = 42.0, pairs
+    return image
+
+
+def _refuted(*images: DepthMap) -> Bool:
+    """What is refuted of the last image by those before it."""
+    placed = np.array([one.T_world_camera for one in images])
+    found = Disagreement(lambda seqs: placed[list(seqs)])
+    return [found.refuted(seq, one) for seq, one in enumerate(images)][-1]
+
+
+def test_what_one_pair_alone_saw_goes_where_earlier_images_see_through_it() -> None:
+    before = [_seen(T, 0.1, k) for k, T in enumerate(PLACES[:2])]
+    false = _refuted(*before, _with_tower(PLACES[2], 3, pairs=1))
+    assert false[TOWER].all()
+    false[TOWER] = False
+    assert not false.any()
+
+
+def test_what_earlier_images_see_or_two_pairs_say_stays() -> None:
+    here, ground = PLACES[0], [_seen(T, 0.1, k) for k, T in enumerate(PLACES[1:])]
+    assert not _refuted(_with_tower(here, 4, pairs=2), _with_tower(here, 3, pairs=1)).any()
+    assert not _refuted(*ground, _with_tower(here, 3, pairs=2)).any()
+    assert not _refuted(_with_tower(here, 3, pairs=1)).any()
+
+
+def test_nothing_is_refuted_where_it_would_be_much_of_an_image_and_so_shows_a_false_pose() -> None:
+    low = _seen(PLACES[2], 0.1, 3)
+    low.depth_m[:, 80:], low.views[:, 80:] = low.depth_m[:, 80:] - 8.0, 1
+    assert not _refuted(*(_seen(T, 0.1, k) for k, T in enumerate(PLACES[:2])), low).any()

@@ -137,8 +137,23 @@ def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later
     surface = SurfaceMap(at_origin)
     seen = view(0.0, sigma_m=0.05)
     unsure, sure = (np.full((1, 1), share, np.float32) for share in (0.03, 0.0))
-    sigma, _ = surface(0, 0, seen, unsure, seen.T_world_camera)
-    np.testing.assert_allclose(sigma, np.hypot(0.05, 0.03 * seen.depth_m), rtol=1e-5)
-    sigma, better = surface(1, 0, seen, sure, seen.T_world_camera)
-    np.testing.assert_allclose(sigma, MIN_FACTOR * 0.05, rtol=1e-5)  # the same image agrees wholly
+    known, _ = surface(0, 0, seen, unsure, seen.T_world_camera)
+    np.testing.assert_allclose(known.sigma_m, np.hypot(0.05, 0.03 * seen.depth_m), rtol=1e-5)
+    known, better = surface(1, 0, seen, sure, seen.T_world_camera)
+    np.testing.assert_allclose(
+        known.sigma_m, MIN_FACTOR * 0.05, rtol=1e-5
+    )  # the same image agrees wholly
     assert better.all()
+
+
+def test_a_false_match_in_the_air_leaves_the_keyframe_and_the_map() -> None:
+    surface, sure = SurfaceMap(at_origin), np.zeros((1, 1), np.float32)
+    for seq in range(2):
+        before = view(0.0)
+        before.views[:] = 2
+        surface(seq, 0, before, sure, before.T_world_camera)
+    new = view(0.0)
+    new.depth_m[20:24, 30:34] -= 8.0
+    known, fresh = surface(2, 0, new, sure, new.T_world_camera)
+    in_air = np.isnan(known.depth_m)
+    assert in_air[20:24, 30:34].all() and in_air.sum() == 16 and not fresh[in_air].any()
