@@ -121,7 +121,7 @@ def _planes(depth: DepthMap, slack_m: float) -> F64 | None:
 
 AGREES_SIGMAS = 2.5
 BEHIND_SIGMAS = 4.0
-WINDOW_PX = 2  # surface must be behind the point at every known pixel this far around it, usually
+WINDOW_PX = 2  # surface must be behind the point at every known pixel this far around it
 
 KNOWN_SHARE = 0.5
 
@@ -146,7 +146,8 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap], window_px: int = 
     """(N,) points that more stereo pairs see through than see.
 
     A keyframe counts with the number of pairs that agree at its pixel. Points that no
-    keyframe sees at all are kept. The first MAX_VIEWS keyframes with a point's place in the
+    keyframe sees at all are kept. Who sees through one sees surface behind it at every known pixel
+    within ``window_px``. The first MAX_VIEWS keyframes with a point's place in the
     image decide; where there may be more of them, give the views as :func:`spread` orders them.
     """
     tiles = Tiles(cloud.xyz_m)

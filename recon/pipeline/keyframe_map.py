@@ -161,9 +161,9 @@ class SurfaceMap:
     def __call__(
         self, seq: int, segment: int, depth: DepthMap, rows_share: F32, T_odom_camera: F64
     ) -> tuple[DepthMap, Bool]:
-        """(The depth in the odometry, without what earlier views refute, its sigma with
-        disagreement of views and an unknown readout, not what all points share; (h, w) surface that
-        is new or better).
+        """(The depth in the odometry without what earlier views see through, (h, w) surface that is
+        new or better). Its sigma holds disagreement of views and an unknown readout, not what all
+        points share.
 
         ``rows_share`` (n, m), all over the image, is the sigma of depth over depth by the rows'
         motion.
