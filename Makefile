@@ -24,9 +24,14 @@ demo: $(CORE)
 # The tests start hundreds of Python processes; each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-# A worker a core and one more, as tests of services wait half of their time; JOBS=0: one after the
-# other, in one process. `make test` is the quick tier; tests named by ARGS run whatever their tier.
-JOBS ?= $(shell $(PYTHON) -c 'import os; print(1 + (os.cpu_count() or 1))')
+# A worker a core and MORE, as tests of services wait half of their time, but none without a GiB of
+# memory; JOBS=0: one after the other, in one process. `make test` is the quick tier; tests named by
+# ARGS run whatever their tier.
+MORE = 1
+test: MORE = 2
+JOBS ?= $(shell $(PYTHON) -c 'import os; \
+  gib = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") >> 30; \
+  print(max(1, min($(MORE) + (os.cpu_count() or 1), gib)))')
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 test: $(STAMP) $(PEERS)
 	$(PYTEST) $(if $(ARGS),$(ARGS),-m "not slow")
