@@ -131,10 +131,9 @@ def chosen_views(found: TriangleViews, shape: tuple[int, int]) -> I32:
     """(N,) the view of each cell of a raster of this shape, the same for neighbours where that
     costs little resolution; -1 where none sees it."""
     seen = np.flatnonzero(found.view[:, 0] >= 0)
-    number = np.full((shape[0] + 2, shape[1] + 2), -1, np.int32)
-    inner = number[1:-1, 1:-1].reshape(-1)
-    inner[seen] = np.arange(len(seen))
-    number[1:-1, 1:-1] = inner.reshape(shape)
+    number = np.full(len(found.view), -1, np.int32)
+    number[seen] = np.arange(len(seen))
+    number = np.pad(number.reshape(shape), 1, constant_values=-1)
     around = number[:-2, 1:-1], number[2:, 1:-1], number[1:-1, :-2], number[1:-1, 2:]
     neighbours = np.column_stack([one.ravel()[seen] for one in around])
     some = TriangleViews(found.view[seen], found.px_per_m[seen], found.bgr[seen])
@@ -150,8 +149,7 @@ def faded_seams(found: TriangleViews, label: I32, shape: tuple[int, int]) -> F32
     Two bands as of Burt and Adelson 1983 (doi:10.1145/245.247), of the differences between views,
     whose fine band stays that of one view.
     """
-    is_seen = found.view >= 0
-    mean = (found.bgr * is_seen[..., None]).sum(axis=1) / np.maximum(is_seen.sum(1), 1)[:, None]
+    mean = found.mean_bgr()
     total, weight = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 1), np.float32)
     own = np.zeros((*shape, 3), np.float32)
     for number, cell, slot in found.by_view():
@@ -168,9 +166,7 @@ def faded_seams(found: TriangleViews, label: I32, shape: tuple[int, int]) -> F32
         total[box] += share * coarse
         weight[box] += share
         own[box] += shows * coarse
-    return np.asarray(
-        np.where(weight > 0.0, total / np.maximum(weight, 1e-9) - own, 0.0), np.float32
-    )
+    return np.asarray(total / np.maximum(weight, 1e-9) - own, np.float32)
 
 
 def _smooth(image: F32, sigma: float) -> F32:

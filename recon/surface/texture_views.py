@@ -62,6 +62,12 @@ class TriangleViews:
             np.zeros((count, CANDIDATES, 3), np.float32),
         )
 
+    def mean_bgr(self) -> F32:
+        """(F, 3) mean of what the views of each triangle show; 0 without any."""
+        is_seen = self.view >= 0  # views that were dropped leave their colours behind
+        total = (self.bgr * is_seen[..., None]).sum(axis=1)
+        return np.asarray(total / np.maximum(is_seen.sum(axis=1), 1)[:, None])
+
     def by_view(self) -> Iterator[tuple[int, I64, I64]]:
         """Each view that sees any, the triangles that it sees, rising, and its slot of each."""
         views = self.view.ravel()

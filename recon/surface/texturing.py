@@ -377,9 +377,7 @@ def faded_steps(
     one part only. A factor is of surroundings as wide as FIELD_SIGMA, so details stay. Where no
     other view sees a place, it is 1.
     """
-    is_seen = found.view >= 0  # views that were dropped leave their colours behind
-    total = (levelled(found, gains).bgr * is_seen[..., None]).sum(axis=1)
-    mean = total / np.maximum(is_seen.sum(axis=1), 1)[:, None]
+    mean = levelled(found, gains).mean_bgr()
     bgr, fields = found.bgr.copy(), list[F32]()
     for view in views:
         h, w = view.bgra.shape[:2]
