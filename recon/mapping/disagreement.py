@@ -114,12 +114,9 @@ class Disagreement:
 
 def _coarser(depth: DepthMap) -> DepthMap:
     """Every second pixel of a depth, or fewer: a window of 3x3 of them is 5x5 of its own."""
-    step = max(2, -(-depth.depth_m.shape[1] // WIDTH_PX))
-    every = np.s_[::step, ::step]
-    return replace(
-        depth, depth_m=depth.depth_m[every].copy(), sigma_m=depth.sigma_m[every].copy(),
-        views=depth.views[every].copy(), K=depth.K / [[step], [step], [1.0]],
-    )  # fmt: skip
+    few = depth.every(max(2, -(-depth.depth_m.shape[1] // WIDTH_PX)))
+    own = few.depth_m.copy(), few.sigma_m.copy(), few.views.copy()  # the whole depth may go
+    return DepthMap(*own, few.K, few.T_world_camera)
 
 
 def _apart(depth: DepthMap, one: _Samples, T_here_there: F64) -> float | None:

@@ -285,15 +285,14 @@ def _packed(seq: int, ordinal: int, segment: int, gray: U8, K: F64, depth: Depth
     size = (min(WIDTH_PX, W), round(min(WIDTH_PX, W) * H / W))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     _, image = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    step = 2 if depth.depth_m.shape[1] >= 2 * MIN_DEPTH_PX else 1
-    z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
-    depth_K = depth.K / np.array([[step], [step], [1.0]])  # every second pixel keeps its place
+    depth = depth.every(2 if depth.depth_m.shape[1] >= 2 * MIN_DEPTH_PX else 1)
+    z = depth.depth_m
     known = np.isfinite(z)
     far = float(z[known].max()) if known.any() else 1.0
     share = np.where(known, np.maximum(np.rint(z * (65535.0 / far)), 1), 0)
     return _Kept(
         seq, ordinal, segment, np.asarray(image, np.uint8), scaled_K(K, size[0] / W, size[1] / H),
-        share.astype(np.uint16), far, sigma.astype(np.float16), depth_K, size,
+        share.astype(np.uint16), far, depth.sigma_m.astype(np.float16), depth.K, size,
     )  # fmt: skip
 
 
