@@ -146,10 +146,10 @@ def frame_scores(
                 scores[name].append(
                     FrameScore(
                         float(covered.sum() / counts.sum()),
-                        _psnr_db(seen, drawn, covered),
+                        psnr_db(seen, drawn, covered),
                         float(likeness[covered].mean()),
-                        _psnr_db(seen, drawn, covered & grids),
-                        _psnr_db(seen, exposed_as(seen, drawn, covered), covered),
+                        psnr_db(seen, drawn, covered & grids),
+                        psnr_db(seen, exposed_as(seen, drawn, covered), covered),
                     )
                 )
         if images is not None:
@@ -161,7 +161,8 @@ def frame_scores(
     return {name: rows for name, rows in scores.items() if rows}
 
 
-def _psnr_db(seen: U8, drawn: U8 | F64, where: Bool) -> float:
+def psnr_db(seen: U8, drawn: U8 | F64, where: Bool) -> float:
+    """Of the pixels ``where`` (H, W) of images (H, W, 3); at most FLOOR_DB."""
     error = float(np.mean((seen[where].astype(np.float64) - drawn[where]) ** 2))
     return min(10.0 * float(np.log10(255.0**2 / max(error, 1e-9))), FLOOR_DB)
 

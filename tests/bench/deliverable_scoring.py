@@ -25,12 +25,13 @@ import numpy as np
 
 from recon.surface import metrics, triangle_grid
 from recon.surface.metrics import Fit
-from recon.surface.raster import STEP_M
+from recon.surface.raster import STEP_M, highest_lowest
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F32, F64, U8, Array, Bool, Camera
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.surface import FILLED, UNCERTAIN
+from service.offline.view_scoring import exposed_as, psnr_db
 from service.sim.recording import Simulation, SimulationOptions, prepare
 from service.sim.render import Look, Renderer
 from service.sim.scoring import alignments, read_scan
@@ -50,6 +51,7 @@ log = logging.getLogger(__name__)
 REACH_M = 5.0
 COVERED_WITHIN_M = 0.5
 ORTHO_REACH_M = 3.0
+STEP_CELL_M, NEAR_STEP_M = 0.25, 0.5
 SAMPLE_SPACING_M = 0.25
 MAX_POINTS = 300_000
 
@@ -180,23 +182,36 @@ def _seen_in(seen: F64, image: _Raster, known: Array, fit: Fit, truth: Truth) ->
 
 
 def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
-    """Shifts of patches against the place rendered from straight above."""
+    """Shifts of patches against the place rendered from straight above, and PSNR of the cells where
+    each of the fits puts them: of all, and of those next to a step of the true surface. The true
+    place has the orthophoto's exposure, by one gain and offset for each channel.
+    """
     image = _Raster(path, truth.frame)
     if len(image.bands) < 4:
         raise InputError(f"{path}: {len(image.bands)} bands; expected red, green, blue, opacity")
     known = image.bands[3] > 0
     try:
-        should = _true_image(image, known.shape, truth)
+        true = _true_image(image, known.shape, truth)
     except InputError as error:
         return image.facts | {"trouble": str(error)}
-    colour = np.ascontiguousarray(image.bands[:3].transpose(1, 2, 0))
-    shown = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    colour = np.ascontiguousarray(image.bands[2::-1].transpose(1, 2, 0))
+    shown, should = (
+        cv2.cvtColor(one, cv2.COLOR_BGR2GRAY).astype(np.float32) for one in (colour, true)
+    )
     found = patch_shifts(shown, should, known, round(ORTHO_REACH_M / image.cell_m))
     out: dict[str, Any] = image.facts | {
         "patches": found.tried,
         "matched_share": found.matched_share,
         "reach_m": ORTHO_REACH_M,
     }
+    for name, fit in fits.items():
+        moved, near = _true_image(image, known.shape, truth, fit), _near_steps(image, truth, fit)
+        there = known & (moved.min(axis=2) > 0)
+        moved = exposed_as(colour, moved, there)
+        out[name] = {
+            "psnr_db": psnr_db(colour, moved, there),
+            "steps_psnr_db": psnr_db(colour, moved, there & near),
+        }
     if not len(found.likeness):
         return out
     (col, row), (du, dv) = found.middle_px.T, found.shift_px.T
@@ -206,7 +221,7 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     for name, fit in fits.items():
         off = (fit.points(here) - there)[:, :2]
         length = np.hypot(*off.T)
-        out[name] = {
+        out[name] |= {
             "rms_m": float(np.sqrt(np.mean(length**2))),
             "median_m": float(np.median(length)),
             "p95_m": float(np.percentile(length, 95)),
@@ -217,21 +232,37 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     return out
 
 
-def _true_image(image: _Raster, shape: tuple[int, int], truth: Truth) -> F32:
-    """(rows, cols) gray of the true place, rendered at half the cells and laid on the file's."""
+def _true_image(image: _Raster, shape: tuple[int, int], truth: Truth, fit: Fit | None = None) -> U8:
+    """(rows, cols, 3) BGR of the true place, rendered at half the cells and laid on the file's,
+    which lie where they say, or where ``fit`` moves them."""
     step = 0.5 * image.cell_m
     row, col = (axis.ravel() for axis in np.meshgrid(*([0.0, 0.5 * n, n - 1.0] for n in shape)))
-    ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))[:, :2]
+    ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))
+    ground = (ground if fit is None else fit.points(ground))[:, :2]
     west, north = ground[:, 0].min() - 2 * step, ground[:, 1].max() + 2 * step
     width, height = (int(n) for n in np.ceil(np.ptp(ground, axis=0) / step) + 4)
     true = view_from_above(truth.folder, west, north, step, (height, width))
-    soft = cv2.GaussianBlur(cv2.cvtColor(true, cv2.COLOR_BGR2GRAY), (0, 0), 1.0)
+    soft = cv2.GaussianBlur(true, (0, 0), 1.0)
     at_px = (ground - [west, north]) * [1.0, -1.0] / step - 0.5
     # A map projection departs from its tangent by millimetres over the length of a flight.
     cell = np.column_stack([col, row, np.ones(len(col))])
     to_px = np.linalg.lstsq(cell, at_px, rcond=None)[0].T
     onto = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(soft, to_px, shape[::-1], flags=onto).astype(np.float32)
+    return np.asarray(cv2.warpAffine(soft, to_px, shape[::-1], flags=onto), np.uint8)
+
+
+def _near_steps(image: _Raster, truth: Truth, fit: Fit) -> Bool:
+    """(rows, cols) cells within NEAR_STEP_M of a step of the true surface higher than STEP_M."""
+    shape = image.bands.shape[1:]
+    few = max(1, round(STEP_CELL_M / image.cell_m))
+    row, col = (n.ravel() for n in np.mgrid[: shape[0] : few, : shape[1] : few] + 0.5 * (few - 1))
+    places = fit.points(image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m)))
+    height = heights_below(truth.surface, places[:, :2]).reshape(-1, -(-shape[1] // few))
+    high, low = highest_lowest(height.astype(np.float32), 1)
+    is_step = ((high - low) > STEP_M).astype(np.uint8)
+    reach = round(NEAR_STEP_M / (few * image.cell_m))
+    near = cv2.dilate(is_step, np.ones((2 * reach + 1,) * 2, np.uint8))
+    return np.asarray(near.repeat(few, 0).repeat(few, 1)[: shape[0], : shape[1]] > 0)
 
 
 def _mesh(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:

@@ -316,6 +316,10 @@ def test_files_are_measured_where_they_say_they_are(flight: Path, tmp_path: Path
     assert abs(ortho["north_m"]) < 0.05 and found["ortho"]["matched_share"] > 0.9
     assert 0.2 < mesh["median_m"] < 0.4 and mesh["completeness"] > 0.85
     assert found["laz"]["raw"]["median_m"] < 0.02 and found["laz"]["epsg"] == 32632
+    delivered(scan, flight, 0.0, 0.3)
+    exact = score_deliverables(scan, flight)["ortho"]["raw"]
+    assert exact["psnr_db"] > 30.0 > ortho["psnr_db"] and exact["steps_psnr_db"] > 25.0
+    assert ortho["steps_psnr_db"] < ortho["psnr_db"] - 1.0
 
 
 def test_a_file_that_is_none_is_named(flight: Path, tmp_path: Path) -> None:
