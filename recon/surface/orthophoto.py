@@ -280,9 +280,12 @@ def _paint(
             _place(places, axes, r, c, near, a, b, share, place)
             total = _mix(place, label, fade, r, c, share, images, colour, mixed)
             for k in range(3):
-                value = float(fallback[r + near // 2, c + near % 2, k])
+                value = 0.0
                 if total > 1e-3:
                     value = mixed[2 - k] / total
+                else:
+                    for n in range(4):
+                        value += share[n] * fallback[r + n // 2, c + n % 2, k]
                 rgb[i, j, k] = np.uint8(min(max(value + 0.5, 0.0), 255.0))
 
 

@@ -103,6 +103,16 @@ def test_ground_that_no_view_sees_takes_the_colour_of_the_model() -> None:
     assert known[hidden].all() and (np.abs(rgb[hidden].astype(int) - 77) < 12).mean() > 0.9
 
 
+def test_colours_of_the_model_run_evenly_from_cell_to_cell() -> None:
+    views = [view(200.0, 200.0)]  # of other ground
+    land = terrain(views)
+    land.raster.rgb[:] = (4 * np.arange(SIDE))[None, :, None]
+    rgb, known = orthophoto(land, views, FINE)
+    row = rgb[220, 3:237, 0].astype(int)
+    assert known[220].all() and np.ptp(row) > 180 and np.diff(row).min() >= 0
+    assert np.diff(row).max() <= 1
+
+
 def test_a_roof_that_the_model_has_too_narrow_is_not_seen_on_the_ground_behind() -> None:
     views = [view(2.0, 12.0)]
     land = terrain(views)
