@@ -275,7 +275,11 @@ def _pixels(
             xyz[n, 0], xyz[n, 1], xyz[n, 2] = x * z, y * z, z
             _normal(depth, K, at_v, at_u, normal[n])
             for k in range(3):
-                rgb[n, k] = bgra[row : row + side, col : col + side, 2 - k].mean()
+                total = 0.0
+                for j in range(row, row + side):
+                    for i in range(col, col + side):
+                        total += bgra[j, i, 2 - k]
+                rgb[n, k] = total / side**2
             side_px[n] = side
             spread_m[n] = sigma[at_v, at_u]
             agree = max(float(views[at_v, at_u]), 1.0)
@@ -388,7 +392,10 @@ def _hide(splats: Splats, view: TextureView, left: F32) -> None:
     h, w = left.shape
     rows, _ = _in_view(splats, view.K, (w, h), view.T_world_camera)
     flat = _projected(splats, rows, view.K, (w, h), view.T_world_camera)
-    _blend(flat, splats.opacity[rows], NO_COLOURS, NO_COLOURS[None], left, NO_SHARES, 1.0 - COVERED)
+    pixels = np.empty((h, w, 4), np.float32)
+    pixels[..., 3] = left
+    _blend(flat, splats.opacity.take(rows), NO_COLOURS, pixels, NO_SHARES, 1.0 - COVERED)
+    left[:] = pixels[..., 3]
 
 
 def _fitted(
@@ -397,31 +404,46 @@ def _fitted(
     """The Gaussians with colours that reproduce the images better: each takes the mean error of the
     pixels that it colours."""
 
-    def errors(number: int) -> tuple[I32, F32]:
+    rooms = [NO_SHARES] * threads()
+
+    def errors(number: int, room: int) -> tuple[I32, F32]:
         progress("fitting colours")
         view = views[number]
         h, w = view.bgra.shape[:2]
-        K, T = view.K, view.T_world_camera
-        rows = _nearest_first(splats, K, (w, h), T)
-        flat, opacity = _projected(splats, rows, K, (w, h), T), splats.opacity[rows]
-        shares = np.empty(_pixels_reached(flat, w, h), np.float32)
-        image, left = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
-        _blend(flat, opacity, rgb[rows], image, left, shares, DONE)
-        error = view.bgra[..., 2::-1].astype(np.float32) - image
-        error[(view.bgra[..., 3] == 0) | (left > 1.0 - COVERED)] = np.nan
+        rows, flat = _nearest_first(splats, view.K, (w, h), view.T_world_camera)
+        reached = _pixels_reached(flat, w, h)
+        if reached > len(rooms[room]):
+            rooms[room] = np.empty(reached, np.float32)
+        shares, pixels = rooms[room][:reached], _unlit(w, h)
+        _blend(flat, splats.opacity.take(rows), rgb.take(rows, 0), pixels, shares, DONE)
+        error = view.bgra[..., 2::-1].astype(np.float32) - pixels[..., :3]
+        error[(view.bgra[..., 3] == 0) | (pixels[..., 3] > 1.0 - COVERED)] = np.nan
         return rows, _back(flat, error, shares)
 
     rgb = splats.rgb
     for first in range(SUBSETS):
         sums = np.zeros((len(splats), 4), np.float32)
         subset = range(first, len(views), SUBSETS)
-        for at in range(0, len(subset), threads()):
-            for rows, found in run_parallel(
-                *(partial(errors, n) for n in subset[at : at + threads()])
-            ):
-                sums[rows] += found
+        for at in range(0, len(subset), len(rooms)):
+            some = enumerate(subset[at : at + len(rooms)])
+            for rows, found in run_parallel(*(partial(errors, n, room) for room, n in some)):
+                _add_rows(sums, rows, found)
         rgb = np.clip(rgb + sums[:, :3] / np.maximum(sums[:, 3:], 0.05), 0, 255)
     return replace(splats, rgb=rgb)
+
+
+def _unlit(w: int, h: int) -> F32:
+    """(h, w, 4) black pixels that nothing hides."""
+    pixels = np.zeros((h, w, 4), np.float32)
+    pixels[..., 3] = 1.0
+    return pixels
+
+
+@njit(cache=True, nogil=True)
+def _add_rows(sums: F32, rows: I32, found: F32) -> None:
+    for m in range(len(rows)):
+        for k in range(found.shape[1]):
+            sums[rows[m], k] += found[m, k]
 
 
 def rendered(
@@ -432,23 +454,24 @@ def rendered(
     As the reference draws them: projected to first order, sorted by depth, front to back.
     """
     w, h = size_px
-    rows = _nearest_first(splats, K, size_px, T_world_camera)
-    flat = _projected(splats, rows, K, size_px, T_world_camera)
-    image, left = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
-    _blend(flat, splats.opacity[rows], splats.rgb[rows], image, left, NO_SHARES, DONE)
-    return image, 1.0 - left
+    rows, flat = _nearest_first(splats, K, size_px, T_world_camera)
+    pixels = _unlit(w, h)
+    _blend(flat, splats.opacity.take(rows), splats.rgb.take(rows, 0), pixels, NO_SHARES, DONE)
+    return pixels[..., :3], 1.0 - pixels[..., 3]
 
 
-def _nearest_first(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> I32:
-    """(M,) the Gaussians that may show in an image; of those equally near, of which flat ground has
-    many, the first one first on every machine."""
+def _nearest_first(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[I32, F32]:
+    """(M,) the Gaussians that may show in an image, and (M, 7) where; of those equally near, of
+    which flat ground has many, the first one first on every machine."""
     rows, depth = _in_view(splats, K, size_px, T)
     # The bits of positive numbers are in their order, and 16 of them are sorted by digits: twice
     # that takes a third of the time.
     bits = depth.view(np.uint32)
     order = np.argsort(bits.astype(np.uint16), kind="stable")
     high = (bits >> 16).astype(np.uint16)[order]
-    return np.asarray(rows[order[np.argsort(high, kind="stable")]])
+    order = order[np.argsort(high, kind="stable")]
+    flat = _projected(splats, rows, K, size_px, T)  # before they are sorted: they lie together
+    return rows.take(order), flat.take(order, 0)
 
 
 def _widest(K: F64, size_px: tuple[int, int]) -> tuple[float, float]:
@@ -553,55 +576,62 @@ def _pixels_reached(flat: F32, w: int, h: int) -> int:
 FAINTEST = 5.6
 """Half the square of the sigmas from a Gaussian's middle to where it hides nothing."""
 
-FADING = np.exp(-FAINTEST * np.arange(1026) / 1024).astype(np.float32)
-"""How much a Gaussian hides that many 1024ths of FAINTEST from its middle."""
+_FADING = np.exp(-FAINTEST * np.arange(1025) / 1024).astype(np.float32)
+FADING = np.column_stack([_FADING[:-1], np.diff(_FADING)])
+"""(1024, 2) how much a Gaussian hides so many 1024ths of FAINTEST from its middle, and what the
+next one differs by."""
 
 NO_COLOURS, NO_SHARES = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _blend(
-    flat: F32, opacity: F32, rgb: F32, image: F32, left: F32, shares: F32, done: float
-) -> None:
+def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: float) -> None:
     """Draw Gaussians one behind the other.
 
-    ``image`` (h, w, 3) is over black, ``left`` (h, w) the share of light that comes from behind; a
-    pixel with less than ``done`` of it takes no more. ``shares`` takes the share of each Gaussian
+    ``pixels`` (h, w, 4) are colours over black and the share of light that comes from behind; one
+    with less than ``done`` of it takes no more. ``shares`` takes the share of each Gaussian
     of the light of each pixel that it reaches. NO_COLOURS are not drawn, NO_SHARES not kept.
     """
-    h, w = left.shape
-    has_colours, keeps, at = rgb.size > 0, shares.size > 0, 0
+    (h, w), light = pixels.shape[:2], pixels.reshape(-1, 4)
+    has_colours, keeps = rgb.size > 0, shares.size > 0
     scale = np.float32(1024.0 / FAINTEST)
     half = scale * np.float32(0.5)
-    most, least = np.float32(LARGEST_ALPHA), np.float32(SMALLEST_ALPHA)
+    most, least, enough = np.float32(LARGEST_ALPHA), np.float32(SMALLEST_ALPHA), np.float32(done)
+    zero, end = np.float32(0.0), np.float32(1024.0)
+    at, one = np.uint64(0), np.uint64(1)  # without a sign none counts from the end
+    red = green = blue = zero
     for n in range(flat.shape[0]):
         u, v, reach_u, reach_v = flat[n, 0], flat[n, 1], flat[n, 5], flat[n, 6]
         uu, uv, vv = half * flat[n, 2], scale * flat[n, 3], half * flat[n, 4]
         first_row, last_row = _span(v, reach_v, h)
         first, last = _span(u, reach_u, w)
+        if has_colours:
+            red, green, blue = rgb[n, 0], rgb[n, 1], rgb[n, 2]
         for row in range(first_row, last_row):
             dv = np.float32(row) - v
+            along, across = uv * dv, vv * dv * dv
+            p = np.uint64(row * w + first)
             for col in range(first, last):
-                share = np.float32(0.0)
-                before = left[row, col]
-                if before >= done:
-                    du = np.float32(col) - u
-                    far = (uu * du + uv * dv) * du + vv * dv * dv
-                    if far < 1024.0:  # also no NaN, nor what no integer holds
-                        far = max(far, np.float32(0.0))
-                        step = np.int32(far)
-                        between = far - np.float32(step)
-                        near = FADING[step] + between * (FADING[step + 1] - FADING[step])
-                        alpha = min(opacity[n] * near, most)
-                        if alpha >= least:
-                            share = alpha * before
-                            left[row, col] = before - share
-                            if has_colours:
-                                for k in range(3):
-                                    image[row, col, k] += share * rgb[n, k]
+                # Without branches: half of them would be guessed wrong.
+                du, before = np.float32(col) - u, light[p, 3]
+                far = (uu * du + along) * du + across
+                is_near = far < end  # also no NaN, nor what no integer holds
+                far = max(far, zero) if is_near else zero
+                step = np.uint32(far)
+                between = far - np.float32(step)
+                near = FADING[step, 0] + between * FADING[step, 1]
+                alpha = min(opacity[n] * near, most)
+                share = alpha * before
+                share = share if is_near & (alpha >= least) & (before >= enough) else zero
+                if has_colours:
+                    light[p, 0] += share * red
+                    light[p, 1] += share * green
+                    light[p, 2] += share * blue
+                light[p, 3] = before - share
+                p += one
                 if keeps:
                     shares[at] = share
-                    at += 1
+                    at += one
 
 
 @njit(cache=True, nogil=True)
