@@ -196,7 +196,7 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         return image.facts | {"trouble": str(error)}
     colour = np.ascontiguousarray(image.bands[2::-1].transpose(1, 2, 0))
     shown, should = (
-        cv2.cvtColor(one, cv2.COLOR_BGR2GRAY).astype(np.float32) for one in (colour, true)
+        cv2.cvtColor(one, cv2.COLOR_BGR2GRAY).astype(np.float32) for one in (colour, true(None))
     )
     found = patch_shifts(shown, should, known, round(ORTHO_REACH_M / image.cell_m))
     out: dict[str, Any] = image.facts | {
@@ -205,8 +205,8 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         "reach_m": ORTHO_REACH_M,
     }
     for name, fit in fits.items():
-        moved, near = _true_image(image, known.shape, truth, fit), _near_steps(image, truth, fit)
-        there = known & (moved.min(axis=2) > 0)
+        moved, near = true(fit), _near_steps(image, truth, fit)
+        there = known & (moved.max(axis=2) > 0)
         moved = exposed_as(colour, moved, there)
         out[name] = {
             "psnr_db": psnr_db(colour, moved, there),
@@ -232,23 +232,31 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     return out
 
 
-def _true_image(image: _Raster, shape: tuple[int, int], truth: Truth, fit: Fit | None = None) -> U8:
-    """(rows, cols, 3) BGR of the true place, rendered at half the cells and laid on the file's,
-    which lie where they say, or where ``fit`` moves them."""
+def _true_image(image: _Raster, shape: tuple[int, int], truth: Truth) -> Callable[[Fit | None], U8]:
+    """(rows, cols, 3) BGR of the true place on the file's cells, which lie where they say, or where
+    a fit moves them by at most ORTHO_REACH_M. Rendered once, at half the cells.
+
+    Raises what :func:`view_from_above` raises.
+    """
     step = 0.5 * image.cell_m
     row, col = (axis.ravel() for axis in np.meshgrid(*([0.0, 0.5 * n, n - 1.0] for n in shape)))
-    ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))
-    ground = (ground if fit is None else fit.points(ground))[:, :2]
-    west, north = ground[:, 0].min() - 2 * step, ground[:, 1].max() + 2 * step
-    width, height = (int(n) for n in np.ceil(np.ptp(ground, axis=0) / step) + 4)
+    places = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))
+    west, north = places[:, 0].min() - ORTHO_REACH_M, places[:, 1].max() + ORTHO_REACH_M
+    size_m = np.ptp(places[:, :2], axis=0) + 2.0 * ORTHO_REACH_M
+    width, height = (int(n) for n in np.ceil(size_m / step) + 1)
     true = view_from_above(truth.folder, west, north, step, (height, width))
     soft = cv2.GaussianBlur(true, (0, 0), 1.0)
-    at_px = (ground - [west, north]) * [1.0, -1.0] / step - 0.5
-    # A map projection departs from its tangent by millimetres over the length of a flight.
-    cell = np.column_stack([col, row, np.ones(len(col))])
-    to_px = np.linalg.lstsq(cell, at_px, rcond=None)[0].T
-    onto = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(soft, to_px, shape[::-1], flags=onto), np.uint8)
+
+    def laid(fit: Fit | None) -> U8:
+        ground = (places if fit is None else fit.points(places))[:, :2]
+        at_px = (ground - [west, north]) * [1.0, -1.0] / step - 0.5
+        # A map projection departs from its tangent by millimetres over the length of a flight.
+        cell = np.column_stack([col, row, np.ones(len(col))])
+        to_px = np.linalg.lstsq(cell, at_px, rcond=None)[0].T
+        onto = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return np.asarray(cv2.warpAffine(soft, to_px, shape[::-1], flags=onto), np.uint8)
+
+    return laid
 
 
 def _near_steps(image: _Raster, truth: Truth, fit: Fit) -> Bool:
