@@ -29,6 +29,10 @@ SLOW_PX = 5.0
 """A median streak beyond it is a shutter too slow. Fields and roads have a direction of their own:
 sharp images show 1 px typically, and up to 5."""
 
+MOTION_SHARE = 1.5
+"""A median streak beyond so many times the motion from image to image is none of motion, as no
+shutter is open for longer: strong compression or noise reduction smears, too."""
+
 KEPT, MIN_KNOWN = 15, 5  # keyframes that the exposure follows from, at most and at least
 
 
@@ -63,20 +67,25 @@ class ExposureWatch:
 
     def __init__(self) -> None:
         self._streaks: deque[tuple[float, float]] = deque(maxlen=KEPT)  # px, px/s
+        self._over_motion: deque[float] = deque(maxlen=KEPT)  # streak over that of an open shutter
         # The strongest ``blur_px`` so far, and the exposure in s then; None while images are sharp.
         self.strongest: tuple[float, float] | None = None
+        self.is_of_motion = True  # the strongest
 
-    def add(self, gray: U8, px_s: F64, gap_s: float) -> None:
-        """Take a keyframe (H, W), the motion (2,) in it and the time since the frame before."""
+    def add(self, gray: U8, px_s: F64, gap_s: float, image_gap_s: float) -> None:
+        """Take a keyframe (H, W), the motion (2,) in it, the time since the frame before and that
+        since the image before, which may not have been tracked."""
         speed = float(np.linalg.norm(px_s))
         if speed * gap_s < SHOWN_PX:
             return
         streak = streak_px(gray, px_s / speed)
         if np.isfinite(streak):  # no frame is exposed for longer than until the next
             self._streaks.append((min(streak, speed * gap_s), speed))
+            self._over_motion.append(streak / (speed * image_gap_s))
             blur_px, exposure_s = self.blur_px, self.exposure_s
             if exposure_s is not None and blur_px > (self.strongest or (0.0, 0.0))[0]:
                 self.strongest = blur_px, exposure_s
+                self.is_of_motion = float(np.median(self._over_motion)) < MOTION_SHARE
 
     @property
     def exposure_s(self) -> float | None:

@@ -102,6 +102,7 @@ class Odometry:
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self._row_track)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
+        self._image_ns = self._image_gap_ns = 0  # the same of images, also those skipped
         self._depth = float("nan")  # median of the last keyframe's landmarks
 
     # ---- one frame -------------------------------------------------------------------
@@ -109,6 +110,7 @@ class Odometry:
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
         """True for a frame that :meth:`track` need not see: the camera has hardly moved since.
         ``frames_per_step`` is how many frames at least are followed from keyframe to keyframe."""
+        self._meet(time_ns)
         if not self._is_metric or self._lost:
             return False
         moved, turned, gap_s = self._model.shift(time_ns, prior, self._depth)
@@ -116,6 +118,11 @@ class Odometry:
         max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
         step = max(moved / self._base_to_height, turned / MAX_TURN_RAD)
         return gap_s < max_gap_s and step * frames_per_step < 1.0
+
+    def _meet(self, time_ns: int) -> None:
+        """Take an image's time, when it is asked about and when it is tracked."""
+        if time_ns != self._image_ns:
+            self._image_gap_ns, self._image_ns = time_ns - self._image_ns, time_ns
 
     def needs_turn(self, time_ns: int) -> bool:
         """True where the prior of a frame should hold the camera's angular velocity."""
@@ -128,6 +135,7 @@ class Odometry:
         expected = self._expected(time_ns, prior)
         new = replace(frame, row_motion=self._row_track.expect(time_ns, prior, expected))
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
+        self._meet(time_ns)
         if not self.keyframes:
             return [self._start(new)]
         if not self._is_metric:
@@ -302,7 +310,7 @@ class Odometry:
             self._row_track.add(new.row_motion, T_camera_odom)
             self._readjust()
             return self._found(new, Tracking.TRACKED, T_odom_camera, tracks)
-        self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns)
+        self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns, 1e-9 * self._image_gap_ns)
         share = 0.5 * SEARCH_SHARE
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, MIN_TRACKS)
         found = found if isinstance(whole, str) else whole

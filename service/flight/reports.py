@@ -205,18 +205,32 @@ class TrackingWatch:
 
 
 def motion_blur(exposure: ExposureWatch, px_per_px: float) -> dict[str, Any] | None:
-    """The strongest blur so far, fit for JSON; None while the images are sharp. ``px_per_px``:
-    pixels of the recording to one of the images that are tracked."""
+    """The strongest blur so far, fit for JSON; None while the images are sharp. Without an
+    exposure where motion cannot have caused it. ``px_per_px``: pixels of the recording to one of
+    the images that are tracked."""
     if exposure.strongest is None:
         return None
     blur_px, exposure_s = exposure.strongest
-    return {"blur_px": round(px_per_px * blur_px, 1), "exposure_ms": round(1e3 * exposure_s, 1)}
+    shown_ms = round(1e3 * exposure_s, 1) if exposure.is_of_motion else None
+    return {"blur_px": round(px_per_px * blur_px, 1), "exposure_ms": shown_ms}
 
 
-def slow_shutter(blur: Mapping[str, Any]) -> str:
+def blur_note(blur: Mapping[str, Any]) -> str:
     """A :func:`motion_blur` for the reader of the scan."""
     px, ms = blur["blur_px"], blur["exposure_ms"]
+    if ms is None:
+        return (
+            f"the images are smeared by {px:.0f} px, farther than they move from one to the next: "
+            "compressed too strongly? record with a higher bitrate"
+        )
     return (
         f"motion blurs the images by {px:.0f} px: the shutter is open for about {ms:.0f} ms, "
         f"{ms / px:.1f} ms would blur by one; set a shorter exposure or fly slower"
     )
+
+
+def blur_warning(blur: Mapping[str, Any]) -> str:
+    """The same for the operator, whose ground station shows 50 characters."""
+    if blur["exposure_ms"] is None:
+        return f"Images smeared by {blur['blur_px']:.0f} px: raise the bitrate"
+    return f"Shutter too slow: images blur by {blur['blur_px']:.0f} px"

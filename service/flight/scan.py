@@ -33,7 +33,7 @@ from service.config import ComputeConfig, Config
 from service.errors import InputError
 from service.flight.pipeline import Pipeline, spacing_of
 from service.flight.recorder import REPLAYED, TAGS_FILE, FrameTags, Recorder
-from service.flight.reports import TrackingWatch, motion_blur, slow_shutter
+from service.flight.reports import TrackingWatch, blur_note, blur_warning, motion_blur
 from service.flight.telemetry_check import TelemetryCheck
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import covering
@@ -213,10 +213,10 @@ class Scan:
         return motion_blur(odometry.exposure, float(self.inputs.camera.K[0, 0] / odometry.K[0, 0]))
 
     def report_blur(self) -> None:
-        """Report to the operator once that the shutter is too slow for the speed."""
+        """Report to the operator once that the images are blurred, and by what."""
         if not self._is_blur_reported and (blur := self.motion_blur) is not None:
             self._is_blur_reported = True
-            self.inputs.warn(f"Shutter too slow: images blur by {blur['blur_px']:.0f} px")
+            self.inputs.warn(blur_warning(blur))
 
     def _hand_out(self, frame: Frame, pose: Pose | None, agl_m: float | None) -> None:
         """A photo, tagged by telemetry, or by vision where telemetry does not tell."""
@@ -360,7 +360,7 @@ class Scan:
         if self.inputs.history is not None and self.tagged == 0 and self.recorder.frames:
             out.append("no frame lies inside the telemetry: poses rest on vision alone")
         if (blur := self.motion_blur) is not None:
-            out.append(slow_shutter(blur))
+            out.append(blur_note(blur))
         shutter = self.found_shutter()
         if shutter is not None and self.inputs.known is None:
             out.append(

@@ -212,6 +212,7 @@ class _Files:
         if self._pieces:
             notes.append(PIECES.format(", ".join(self._pieces)))
         times = [p.time_unix_ns / 1e9 for p in self._poses]
+        quality = _quality(fused, self._raster, self._poses)
         return {
             "schema": 1,
             "id": header.scan_id,
@@ -236,11 +237,11 @@ class _Files:
                 "points_before_fusion": fused.points_in,
                 "poses": len(self._poses),
             },
-            "quality": _quality(fused, self._raster, self._poses)
+            "quality": quality
             | {
                 "sigma_absolute_median_m": _absolute_m(fused.cloud, self._shared),
                 "scale_sigma": scale_sigma(run, header.georeference),
-                "trust": trust_of(run, header.georeference, slope_deg(fused.cloud.xyz_m)),
+                "trust": trust_of(run, header.georeference, slope_deg(fused.cloud.xyz_m), quality),
             },
             "notes": notes,
             "coverage": None if self._coverage is None else self._coverage.figures(),

@@ -66,6 +66,11 @@ MAX_REFUTED_SHARE = 0.05
 """Of the steps of the track; where vision is refuted more often, it errs elsewhere by as much as
 attitude and positions do not show."""
 
+MAX_PIXELS_OFF = 10.0
+"""Median sigma of the points in pixels on the ground, above which the shape is in doubt: where
+images match to a pixel, not to the usual twentieth of one, pairs a tenth of the height apart err
+by so much."""
+
 BY_SURVEY = "control points"  # georeference of a scan that control points have placed
 
 FIRST_TELEMETRY = "first telemetry"
@@ -81,7 +86,12 @@ class Trust(Enum):
     DOUBTFUL = "doubtful"  # not even the shape is certain
 
 
-def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) -> dict[str, Any]:
+def trust_of(
+    run: Mapping[str, Any],
+    georeference: str,
+    slope_deg: float = 0.0,
+    points: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """The level as ``level`` and what limits it as ``reasons``, both for scan.json.
 
     Args:
@@ -90,6 +100,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
             Missing or malformed ones limit nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
+        points: ``sigma_median_m`` and ``ground_sample_m`` of the cloud.
     """
     assumed = _assumed(run)
     scale = run.get("scale")
@@ -137,6 +148,12 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     refuted = f"{broken:.0f} of {steps:.0f} steps of vision contradict attitude and positions"
     if broken > MAX_REFUTED_SHARE * steps:
         doubts.append(f"{refuted}: the images are too poor")
+    sigma_m, sample_m = _number(points, "sigma_median_m"), _number(points, "ground_sample_m")
+    if sigma_m and sample_m and sigma_m > MAX_PIXELS_OFF * sample_m:
+        doubts.append(
+            f"half of the points are uncertain by {sigma_m:.1f} m or more, "
+            f"{sigma_m / sample_m:.0f} pixels on the ground: the images match too poorly"
+        )
     unsized = []
     if "start" in assumed:
         unsized.append("when the recording began is assumed, and no turn confirms it")

@@ -19,7 +19,7 @@ from recon.stereo.virtual_stereo import drop_unseen, rectify
 from recon.tracking.motion_blur import ExposureWatch, streak_px
 from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Camera, PosePrior, StereoPair
-from service.flight.reports import motion_blur, slow_shutter
+from service.flight.reports import blur_note, blur_warning, motion_blur
 from service.flight.scan import Scan, ScanInputs
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
@@ -62,12 +62,14 @@ def test_an_image_without_texture_has_no_streak() -> None:
     assert np.isnan(streak_px(ramp, np.array([1.0, 0.0])))
 
 
-def watch_of(image: U8, exposure_s: float, speeds: list[float]) -> ExposureWatch:
+def watch_of(
+    image: U8, exposure_s: float, speeds: list[float], image_gap_s: float = 1.0 / FPS
+) -> ExposureWatch:
     watch = ExposureWatch()
     for speed in speeds:
         shot = blurred(image, speed * exposure_s, 20.0) if exposure_s else image
         d = np.radians(20.0)
-        watch.add(shot, speed * np.array([np.cos(d), np.sin(d)]), 1.0 / FPS)
+        watch.add(shot, speed * np.array([np.cos(d), np.sin(d)]), 1.0 / FPS, image_gap_s)
     return watch
 
 
@@ -80,6 +82,21 @@ def test_the_exposure_follows_from_streaks_and_speeds(image: U8) -> None:
     assert watch_of(image, 0.02, speeds[:4]).exposure_s is None, "too few"
     slow = watch_of(image, 0.02, [20.0] * 9)  # 1.3 px from frame to frame
     assert slow.exposure_s is None
+
+
+def test_a_smear_longer_than_the_motion_between_images_is_not_blamed_on_the_shutter(
+    image: U8,
+) -> None:
+    """Frames are 67 ms apart for those that are tracked; of those that come, 10 or 33."""
+    speeds = [300.0, 450.0, 600.0, 350.0, 500.0]
+    motion = motion_blur(watch_of(image, 0.03, speeds, 0.033), 1.0)
+    assert motion is not None and motion["exposure_ms"] == pytest.approx(30.0, rel=0.2)
+    assert "shutter" in blur_note(motion) and "Shutter" in blur_warning(motion)
+    smear = motion_blur(watch_of(image, 0.03, speeds, 0.010), 1.0)
+    assert smear is not None and smear["exposure_ms"] is None
+    assert smear["blur_px"] == motion["blur_px"]
+    assert "compressed" in blur_note(smear) and "shutter" not in blur_note(smear)
+    assert "bitrate" in blur_warning(smear) and len(blur_warning(smear)) <= 50
 
 
 def photograph(ground: U8, T_world_camera: F64) -> U8:
@@ -114,7 +131,7 @@ def test_a_shutter_too_slow_for_the_speed_is_seen_in_the_images() -> None:
     blur = motion_blur(odometry.exposure, 2.0)
     assert blur is not None and blur["exposure_ms"] == pytest.approx(50.0, rel=0.3)
     assert blur["blur_px"] > 10.0, "px of the recording, twice as fine"
-    assert f"images by {blur['blur_px']:.0f} px" in slow_shutter(blur)
+    assert f"images by {blur['blur_px']:.0f} px" in blur_note(blur)
 
 
 def test_the_operator_hears_once_that_the_shutter_is_too_slow() -> None:

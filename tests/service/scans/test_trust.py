@@ -67,6 +67,14 @@ def test_the_weakest_fact_sets_the_level(
     assert all(reason in text for text in found["reasons"])
 
 
+def test_points_that_are_uncertain_by_many_pixels_leave_the_shape_in_doubt() -> None:
+    usual = {"sigma_median_m": 0.06, "ground_sample_m": 0.12}
+    assert trust_of(SURE, "gnss", points=usual) == trust_of(SURE, "gnss")
+    poor = trust_of(SURE, "gnss", points=usual | {"sigma_median_m": 2.43})
+    assert poor["level"] == "doubtful" and "2.4 m or more, 20 pixels" in poor["reasons"][0]
+    assert trust_of(SURE, "gnss", points=dict.fromkeys(usual))["level"] == "georeferenced"
+
+
 def test_a_doubtful_scan_names_the_source_of_its_scale_too() -> None:
     found = trust_of(SURE | {"assumed": ["view", "level", "height"]}, "none")
     assert found["level"] == "doubtful" and len(found["reasons"]) == 2
