@@ -13,18 +13,34 @@ MOST, WIDTH_PX = 3000, 1600  # features that are matched, and the width at which
 MAX_SHARE = 0.02  # of the height; rows further apart are another pair, or not rectified
 MIN_MATCHES, MIN_CONSENT = 60, 0.5  # features, and the share of them of the disparities
 RANGE_PERCENTILES = 2.0, 98.0
+MIN_COMPARED, MIN_IN_ROWS = 10, 0.7
+"""Features that match, and the share of them in about the same row that those of a pair have. Of
+two images with nothing in common some match by chance; where one is mirrored, half in a row."""
 TOLERANCE_PX = 0.5  # by which places of features err
 MIN_OFF_PX = 0.5  # rows that are less apart stay: matching bridges half a pixel
 
 
 def features_apart(left: U8, right: U8) -> tuple[F64, F64]:
     """Features of two images (h, w) that match: (N, 2) px in ``right``, and how much farther right
-    and lower ``left`` shows them, (N, 2) px; those in about the same row."""
+    and lower ``left`` shows them, (N, 2) px."""
     a, b = (features(g, WIDTH_PX, MOST, are_strongest=True) for g in (left, right))
     rows_a, rows_b = mutual(a.descriptors, b.descriptors)
-    there, apart = b.uv_px[rows_b], a.uv_px[rows_a] - b.uv_px[rows_b]
-    near = np.abs(apart[:, 1]) < MAX_SHARE * left.shape[0]
-    return there[near], apart[near]
+    return b.uv_px[rows_b], a.uv_px[rows_a] - b.uv_px[rows_b]
+
+
+def in_rows(apart: F64, height: int) -> Bool:
+    """(N,) which features ``apart`` (N, 2) px lie in about the same row of images so high."""
+    return np.asarray(np.abs(apart[:, 1]) < MAX_SHARE * height)
+
+
+def rows_missed(apart: F64, height: int) -> float | None:
+    """How many px lower the right image shows most features ``apart`` (N, 2) px, where too few are
+    in about the same row; NaN where they do not agree, None where enough are."""
+    if len(apart) < MIN_COMPARED or in_rows(apart, height).mean() >= MIN_IN_ROWS:
+        return None
+    lower = -float(np.median(apart[:, 1]))
+    is_common = np.mean(np.abs(apart[:, 1] + lower) < MAX_SHARE * height) >= MIN_IN_ROWS
+    return lower if is_common else float("nan")
 
 
 def range_missed(apart: F64, disparities: tuple[float, float]) -> tuple[float, float] | None:
@@ -45,9 +61,9 @@ def rows_apart(
     size: tuple[int, int], there: F64, apart: F64, disparities: tuple[float, float]
 ) -> F64 | None:
     """(3,) a, b, c: what the right image shows at (u, v) lies a + b u + c v px lower than in the
-    left one, of this (h, w), by features whose disparity is within ``disparities``, ``there`` and
-    ``apart`` as of :func:`features_apart`. None where rows surely do not differ, or too little
-    agrees on how.
+    left one, of this (h, w), by features in its rows whose disparity is within ``disparities``,
+    ``there`` and ``apart`` as of :func:`features_apart`. None where rows surely do not differ, or
+    too little agrees on how.
     """
     near = _within(apart[:, 0], disparities)
     if np.count_nonzero(near) < 2 * MIN_MATCHES:  # two in five agree

@@ -55,15 +55,17 @@ def stereo(
     and surface outside the right image are unknown. --checked keeps only verified disparities,
     as in flight. Rows that lie apart, by a calibration a little off, are brought together;
     where one image is blurred, the other is blurred as much, and a little are both where noise
-    hides what they show.
+    hides what they show; dark images are stretched.
     """
     from recon.calibration.row_alignment import (
         features_apart,
+        in_rows,
         range_missed,
         rows_aligned,
         rows_apart,
+        rows_missed,
     )
-    from recon.image_quality import alike
+    from recon.image_quality import alike, stretch
     from service.compute.backend_choice import choose_backend, load_learned_model
 
     gray_left, gray_right = read_pair(left, right)
@@ -81,6 +83,9 @@ def stereo(
     chosen = choose_backend(backend) if model is None else load_learned_model(model)
     looked_for = min_disparity, min_disparity + labels
     there, features = features_apart(gray_left, gray_right)
+    _warn_of_rows(rows_missed(features, len(gray_left)))
+    is_in_row = in_rows(features, len(gray_left))
+    there, features = there[is_in_row], features[is_in_row]
     apart = rows_apart(gray_left.shape, there, features, looked_for)
     missed = range_missed(features, looked_for)
     if missed is not None:
@@ -92,7 +97,7 @@ def stereo(
         )  # fmt: skip
     if apart is not None:
         gray_right = rows_aligned(gray_right, apart)
-    gray_left, gray_right, *blurs_px = alike(gray_left, gray_right)
+    gray_left, gray_right, *blurs_px = alike(stretch(gray_left), stretch(gray_right))
     start = time.perf_counter()
     with refusing("stereo"):
         found = chosen.belief_propagation(gray_left, gray_right, labels, config)
@@ -112,6 +117,21 @@ def stereo(
         elif any(blurs_px):
             said += f", {'left' if blurs_px[0] else 'right'} image sharper: blurred like the other"
         print(f"{out}: {_size(gray_left)}, {100 * known:.1f} % known, {chosen.name}{said}")
+
+
+def _warn_of_rows(lower_px: float | None) -> None:
+    if lower_px is None:
+        return
+    if lower_px == lower_px:
+        log.warning(
+            "The right image shows most features %.0f px lower than the left one: rectify the pair",
+            lower_px,
+        )
+    else:
+        log.warning(
+            "What matches in the two images does not lie in the same rows: do both show the same "
+            "scene, rectified, and neither mirrored nor turned?"
+        )
 
 
 def matching_config(
@@ -146,16 +166,31 @@ def read_pair(left: Path, right: Path) -> tuple[U8, U8]:
 
 def read_gray(path: Path) -> Any:
     """A gray image (h, w) of as many bits as it has; InputError when there is none."""
-    import cv2
     import numpy as np
 
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(data) else None
+    image = _decoded(data) if len(data) else None
     if image is None:
         raise InputError(f"{path}: not an image that can be read; give PNG, JPEG or TIFF")
     return image
+
+
+TIFF = b"II*\0", b"MM\0*"
+
+
+def _decoded(data: U8) -> Any:
+    """A gray image of a file's bytes; None when there is none."""
+    import cv2
+    import numpy as np
+
+    if data[:4].tobytes() in TIFF:  # OpenCV reads colours of floats as they are alone
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        if image is not None and image.ndim == 3 and image.dtype == np.float32:
+            has_alpha = image.shape[2] == 4
+            return cv2.cvtColor(image, cv2.COLOR_BGRA2GRAY if has_alpha else cv2.COLOR_BGR2GRAY)
+    return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
 
 
 def check_output(path: Path, suffix: str) -> None:

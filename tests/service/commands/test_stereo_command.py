@@ -111,6 +111,51 @@ def test_disparities_that_are_not_looked_for_are_reported(
     assert words in caplog.text and ("disparities of" in caplog.text) == bool(words)
 
 
+def scene(size_px: tuple[int, int] = (400, 240)) -> U8:
+    W, H = size_px
+    canvas = np.random.default_rng(0).normal(128, 90, (H, W)).astype(np.float32)
+    soft = np.asarray(cv2.GaussianBlur(canvas, (0, 0), 1.3))
+    return np.asarray(soft.clip(0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("turned", "words"),
+    [
+        (lambda image: image, ""),
+        (lambda image: image[:, ::-1], "neither mirrored nor turned"),
+        (lambda image: image[::-1], "neither mirrored nor turned"),
+        (lambda image: np.roll(image, 9, axis=0), "most features 9 px lower"),
+    ],
+)
+def test_a_pair_whose_rows_do_not_match_is_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, turned: Callable[[U8], U8], words: str
+) -> None:
+    names, canvas = (tmp_path / "a.png", tmp_path / "b.png"), scene()
+    for name, image in zip(names, (canvas[:, 60:380], turned(canvas[:, 69:389])), strict=True):
+        cv2.imwrite(str(name), image)
+    out = tmp_path / "d.npy"
+    assert run("stereo", *names, "--labels", 16, "--out", out, "--backend", "cpu") == 0
+    assert words in caplog.text and ("rectif" in caplog.text) == bool(words)
+
+
+def test_colours_of_floats_are_read(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    names = tmp_path / "a.tiff", tmp_path / "b.tiff"
+    for name, of in zip(names, pair, strict=True):
+        image = cv2.imread(str(of))
+        assert image is not None
+        cv2.imwrite(str(name), image.astype(np.float32) / np.float32(255))
+    out = tmp_path / "d.npy"
+    assert run("stereo", *names, "--labels", 16, "--out", out, "--backend", "cpu") == 0
+    assert right_share(np.load(out)) > 0.98
+
+
+def test_a_dark_image_is_matched_with_a_bright_one(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    """A thirtieth of the light: eight levels are left."""
+    left, right = (np.asarray(cv2.imread(str(name), 0), np.float32) for name in pair)
+    dark = np.asarray((0.03 * left).astype(np.uint8))
+    assert right_share(found_by(tmp_path, dark, right.astype(np.uint8))) > 0.97
+
+
 def test_an_image_of_a_pixel_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     name = tmp_path / "a.png"
     cv2.imwrite(str(name), np.zeros((1, 1), np.uint8))
