@@ -83,8 +83,10 @@ class AutopilotLink:
         clock = self._clocks.setdefault(packet.component, BootClock())
         reboots = clock.reboots
         time_ns = clock.time_of(sample.boot_ms, now_ns)
-        if clock.reboots != reboots:
-            self._rebooted(packet.component)
+        if clock.reboots != reboots and autopilot is not None and packet.component == speaker:
+            self._start_over()
+            self._restarted()
+            self._say(texts.WARNING, "Autopilot restarted; telemetry starts over")
         self._history.add(sample, time_ns)
 
     def follow(self) -> None:
@@ -100,14 +102,6 @@ class AutopilotLink:
         self._history.clear()
         self.timesync.reset()
         self._rates.restart()
-
-    def _rebooted(self, component: int) -> None:
-        autopilot = self._presence.autopilot
-        if autopilot is None or component != autopilot[1]:
-            return
-        self._start_over()
-        self._restarted()
-        self._say(texts.WARNING, "Autopilot restarted; telemetry starts over")
 
     def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
         is_autopilot = (packet.system, packet.component) == self._presence.autopilot

@@ -171,20 +171,16 @@ class CameraComponent:
     def _follow_status(self) -> None:
         """Send the status if it is not as it was sent last: the only place that sees it change."""
         status = self._control.status()
-        if self._is_recording and not status.is_recording:
-            self._end_recording()
+        if self._is_recording and not status.is_recording:  # however it ended
+            self._while_recording.end()
+            self.stop_shooting()
+            self._fail(len(self._waiting), "the scan has ended")
         self._is_recording = status.is_recording
         every_s = 0.0 if self._series is None else self._series[0]
         shown = self._image_status(), int(status.is_recording), every_s
         if shown != self._shown:
             self._shown = shown
             self._outbox.put(CAMERA, self._capture_status(status))
-
-    def _end_recording(self) -> None:
-        """Forget what a recording's operators asked for, however it ended."""
-        self._while_recording.end()
-        self.stop_shooting()
-        self._fail(len(self._waiting), "the scan has ended")
 
     # Messages.
 

@@ -26,7 +26,6 @@ from mavlink.component.metadata import (
     VENDOR,
     ComponentMetadataMessage,
     camera_definition,
-    definition_version,
     metadata_files,
 )
 from mavlink.component.metadata import NUMBER as METADATA
@@ -45,6 +44,7 @@ S = 1_000_000_000
 MS = 1_000_000
 COMPONENTS = (ONBOARD, CAMERA)
 LOAD_STATUS, MOTION = 390, 251
+LOAD_EVERY_US = 2_000_000
 HEARD = numbers_of((*READERS, "HEARTBEAT", "SYSTEM_TIME", "TIMESYNC")) | TO_ONE | {COMMAND_CANCEL}
 """Numbers of the messages that :meth:`Companion.receive` handles."""
 
@@ -57,7 +57,6 @@ FAST_US = 400_000  # streams with a shorter interval, down to 20 ms, need the sh
 class CompanionConfig:
     parameters: Mapping[str, float] = field(default_factory=dict)  # this aircraft's defaults
     watch: WatchConfig = field(default_factory=WatchConfig)
-    load_every_s: float = 2.0
     motion_every_s: float = 1.0
 
 
@@ -103,12 +102,12 @@ class Companion:
             self._outbox, self._parameter_changed, kept_parameters, with_defaults(config.parameters)
         )
         table = self.parameters.table
-        definition = camera_definition(VENDOR, MODEL, table)
+        version, definition = camera_definition(VENDOR, MODEL, table)
         metadata = metadata_files(table)
         self._general = metadata[GENERAL]
         self._files = FileServer({DEFINITION: definition, **metadata})
         self.camera = CameraComponent(
-            definition_version(table),
+            version,
             control,
             self._outbox,
             self._boot_ms,
@@ -117,9 +116,14 @@ class Companion:
         )
         self.desk = CommandDesk(COMMANDS, self._outbox, self, self._answer, is_stop)
         self.streams = {
-            (ONBOARD, LOAD_STATUS): Stream(round(config.load_every_s * 1e6), self._send_load),
-            (ONBOARD, MOTION): Stream(round(config.motion_every_s * 1e6), self._send_motion),
-        } | {(CAMERA, n): Stream(-1, partial(self._send_camera, n)) for n in self.camera.STREAMED}
+            (component, number): Stream(us, partial(self.send_requested, component, number))
+            for component, number, us in (
+                (ONBOARD, LOAD_STATUS, LOAD_EVERY_US),
+                *((CAMERA, number, -1) for number in self.camera.STREAMED),
+            )
+        }
+        every_us = round(config.motion_every_s * 1e6)
+        self.streams[ONBOARD, MOTION] = Stream(every_us, self._send_motion)
         self._waiting: list[_Waiting] = []
         self._is_recording, self._watch_ns = False, now_ns
 
@@ -140,18 +144,16 @@ class Companion:
             listener(message)
         self.autopilot.hear(message, packet, link, now_ns)
         if name.startswith("COMMAND_"):
-            self._hear_command(message, link, now_ns)
+            call = decode_call(message, link)
+            if call is not None and self._is_for_us(call.target):
+                self.desk.receive(call, COMPONENTS, now_ns)
         elif name.startswith("PARAM_"):
             self._hear_parameter(message, name)
-        elif name == "FILE_TRANSFER_PROTOCOL":
-            self._hear_file_request(message, link)
+        elif name == "FILE_TRANSFER_PROTOCOL" and message.target_component:
+            target = Address(message.target_system, message.target_component)
+            if self._is_for_us(target):
+                self._files.serve(message, link, self._outbox)
         self.watch.hear(packet, message, now_ns)  # after the sender of a heartbeat is known
-
-    def _hear_command(self, message: Any, link: int, now_ns: int) -> None:
-        call = decode_call(message, link)
-        if call is None or not self._is_for_us(call.target):
-            return
-        self.desk.receive(call, COMPONENTS, now_ns)
 
     def when_disarmed(self, what: str, act: Callable[[], Handled]) -> Handled:
         """Act once the autopilot reports from now on that it is disarmed; what it reported before
@@ -189,21 +191,14 @@ class Companion:
             self.desk.cancel(number, now_ns)
 
     def _hear_parameter(self, message: Any, name: str) -> None:
-        target = getattr(message, "target_system", None)
-        if target is None or target not in (0, self.presence.system):
+        if getattr(message, "target_system", None) not in (0, self.presence.system):
             return
         extended = name.startswith("PARAM_EXT_")
         if message.target_component not in (0, CAMERA if extended else ONBOARD):
             return
         answer = self.parameters.receive(message)
-        if isinstance(answer, Answer) and answer.text:
+        if answer is not None and answer.text:
             self._answer(texts.WARNING, answer.text)
-
-    def _hear_file_request(self, message: Any, link: int) -> None:
-        target = Address(message.target_system, message.target_component)
-        if target.component == 0 or not self._is_for_us(target):
-            return
-        self._files.serve(message, link, self._outbox)
 
     def _parameter_changed(self, name: str, value: float) -> Answer:
         answer = self.control.parameter_changed(name, value)
@@ -269,8 +264,10 @@ class Companion:
         """Call ``listener`` with every message of a name, from any sender."""
         self._listeners.setdefault(name, []).append(listener)
 
-    def send_requested(self, component: int, number: int, index: int, link: int) -> bool:
-        """Send a requested message; False when the component has no such message."""
+    def send_requested(
+        self, component: int, number: int, index: int = 0, link: int | None = None
+    ) -> bool:
+        """Send a message, to everyone without a ``link``; False when the component has none."""
         if component == CAMERA:
             message = self.camera.message(number, index)
         elif number == METADATA:
@@ -290,15 +287,6 @@ class Companion:
         interval_us = self.streams[component, number].interval_us
         message = dialect.MAVLink_message_interval_message(number, interval_us)
         self._outbox.put(component, message, link)
-
-    def _send_camera(self, number: int) -> None:
-        message = self.camera.message(number)
-        if message is not None:
-            self._outbox.put(CAMERA, message)
-
-    def _send_load(self) -> None:
-        if self.load is not None:
-            self.send(computer_status(self.load, self._unix_us(), self._boot_ms()))
 
     def _send_motion(self) -> None:
         for message in motion_values(self.control.status(), self._boot_ms()):

@@ -92,23 +92,18 @@ def _parameter(p: Parameter) -> dict[str, object]:
     return described | {"decimalPlaces": 2, "increment": p.step}
 
 
-def camera_definition(vendor: str, model: str, table: Sequence[Parameter]) -> bytes:
-    """The XML of a camera with these parameters; its version is :func:`definition_version`."""
-    body = "".join(_described(parameter) for parameter in table)
-    version = definition_version(table)
-    return (
+def camera_definition(vendor: str, model: str, table: Sequence[Parameter]) -> tuple[int, bytes]:
+    """Version and XML of a camera with these parameters. The version, 1 to 65535, changes with the
+    parameters, because ground stations cache the file."""
+    body = "".join(map(_described, table))
+    version = zlib.crc32(body.encode()) & 0xFFFF or 1
+    return version, (
         '<?xml version="1.0" encoding="UTF-8" ?>\n<mavlinkcamera>\n'
         f'  <definition version="{version}">\n'
         f"    <model>{escape(model)}</model>\n    <vendor>{escape(vendor)}</vendor>\n"
         "  </definition>\n  <parameters>\n"
         f"{body}  </parameters>\n</mavlinkcamera>\n"
     ).encode()
-
-
-def definition_version(table: Sequence[Parameter]) -> int:
-    """1 to 65535; changes with the parameters, because ground stations cache the file."""
-    body = "".join(_described(parameter) for parameter in table)
-    return zlib.crc32(body.encode()) & 0xFFFF or 1
 
 
 def _described(p: Parameter) -> str:

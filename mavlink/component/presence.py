@@ -96,7 +96,7 @@ class Presence:
         self.remembered = remembered
         self.is_proven = False  # no evidence for another vehicle
         self._token = token  # in custom_mode: distinguishes our echo from another companion
-        self._lock = threading.Lock()  # of the heartbeats
+        self._lock = threading.RLock()  # of the heartbeats
         self._health = Health.BOOT
         self._confirmed_ns = now_ns
         self.next_ns = now_ns if first_ns is None else first_ns  # time of the next heartbeats
@@ -133,15 +133,12 @@ class Presence:
     def health(self, now_ns: int) -> Health | None:
         """State for the heartbeat; None once the service must be considered dead."""
         with self._lock:
-            return self._state(now_ns)
-
-    def _state(self, now_ns: int) -> Health | None:
-        silent = (now_ns - self._confirmed_ns) / S
-        if self._health is Health.BOOT:
+            health, silent = self._health, (now_ns - self._confirmed_ns) / S
+        if health is Health.BOOT:
             return Health.BOOT if silent < self.config.boot_s else None
         if silent < self.config.stale_s:
-            is_waiting = self._health is Health.STANDBY and not self.is_ready
-            return Health.NOT_READY if is_waiting else self._health
+            is_waiting = health is Health.STANDBY and not self.is_ready
+            return Health.NOT_READY if is_waiting else health
         return Health.CRITICAL if silent < self.config.dead_s else None
 
     def due(self, now_ns: int) -> list[OutgoingMessage]:
@@ -151,7 +148,7 @@ class Presence:
                 return []
             late = now_ns - self.next_ns
             self.next_ns = now_ns + PERIOD_NS - (late if late < PERIOD_NS else 0)
-            state = self._state(now_ns)
+            state = self.health(now_ns)
             if state is None:
                 return []
             return [

@@ -103,7 +103,11 @@ class VehicleLink:
         self.recorder = TlogRecorder()
         key = None if config.signing_key is None else read_key(config.signing_key)
         self._memory = Memory(config.state_dir, "" if key is None else fingerprint(key))
-        self.signing = None if key is None else self._make_signing(key)
+        self.signing = None
+        if key is not None:
+            # A crash forgets what was sent in the last second, and by the stand-in after it.
+            ours = self._memory.signing_timestamp + round((1.0 + AFTER_S[-1]) * UNIT_PER_S)
+            self.signing = Signing(key, ours, self._memory.signing_streams)
         self.presence = Presence(
             config.presence,
             secrets.randbits(32) or 1 if first is None else first.token,
@@ -133,12 +137,6 @@ class VehicleLink:
             self._stand_in = StandIn()
         sequence = 0 if first is None else first.sequence
         self._links = Links(opened, self._on_packet, self.signing, sequence)
-
-    def _make_signing(self, key: bytes) -> Signing:
-        # A crash forgets what was sent in the last second, and by the stand-in after it.
-        forgotten = round((1.0 + AFTER_S[-1]) * UNIT_PER_S)
-        ours = self._memory.signing_timestamp + forgotten
-        return Signing(key, ours, self._memory.signing_streams)
 
     # Called by the service.
 
@@ -276,7 +274,7 @@ class VehicleLink:
         while not self._stop.is_set():
             self._serve(self._companion.pause_s)
             now_ns = self._alive_ns = self._clock_ns()
-            self._guard(partial(self._companion.tick, now_ns))
+            self._guard(self._companion.tick, now_ns)
             self._send(self._companion.take())
             is_stale = self._memory.is_stale(
                 self._companion.parameters.revision, self.presence.proven_system
@@ -292,16 +290,13 @@ class VehicleLink:
         telemetry, jobs = self._inbox.take(wait_s)
         for job in jobs:  # first: a heartbeat identifies the telemetry that follows
             self._guard(job)
-        for index, packet, now_ns in telemetry:
-            try:
-                self._hear(index, packet, now_ns)
-            except Exception:
-                log.exception("fault while processing telemetry")
+        for received in telemetry:
+            self._guard(self._hear, *received)
 
-    def _guard(self, job: Job) -> None:
+    def _guard(self, job: Callable[..., object], *given: object) -> None:
         """Run a job; a fault in the service's handler must not end the link."""
         try:
-            job()
+            job(*given)
         except Exception:
             log.exception("fault while serving MAVLink")
 
@@ -348,8 +343,8 @@ class VehicleLink:
 
     def _flush(self, wait_s: float) -> None:
         packets, jobs = self._disk.take(wait_s)
-        for data, now_ns in packets:  # first: a log ends with what was heard before
-            self._guard(partial(self.recorder.write, data, now_ns))
+        for packet in packets:  # first: a log ends with what was heard before
+            self._guard(self.recorder.write, *packet)
         for job in jobs:
             self._guard(job)
 

@@ -106,7 +106,7 @@ MAX_SUBSCRIBERS = 16  # of one message; the oldest makes room
 class Stream:
     """A repeated message. Each subscriber has an interval of its own; the shortest one counts."""
 
-    def __init__(self, default_us: int, send: Callable[[], None]) -> None:
+    def __init__(self, default_us: int, send: Callable[[], object]) -> None:
         """``default_us`` holds without subscribers; -1: only sent on request."""
         self._default_us, self._send = default_us, send
         self._wanted: dict[Address, int] = {}
