@@ -17,7 +17,6 @@ from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPai
 if TYPE_CHECKING:
     from recon.mapping.registration import IcpConfig
     from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.stereo.reprojection import DepthFusionConfig
     from recon.stereo.upsampling import UpsamplingConfig
 
 
@@ -27,7 +26,6 @@ class DenseStages:
 
     matching: BeliefPropagationConfig
     upsampling: UpsamplingConfig
-    fusion: DepthFusionConfig
 
 
 class Backend(Protocol):

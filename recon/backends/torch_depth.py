@@ -35,7 +35,6 @@ from recon.stereo.reprojection import (
     MIN_COMMON,
     NOISE_STRIDE,
     PAIRS_CORRELATION,
-    DepthFusionConfig,
 )
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
 from recon.stereo.upsampling import MIN_CONFIDENCE, UpsamplingConfig
@@ -76,7 +75,7 @@ class DensePath:
         found = torch.zeros((2, pairs, size_px[1], size_px[0]), device=self.device)
 
         def fused() -> tuple[Tensor, Tensor, Tensor]:
-            return fused_pairs(found[0], found[1], self.stages.fusion)
+            return fused_pairs(found[0], found[1])
 
         return found, Plan(self.device, fused, [])
 
@@ -121,13 +120,11 @@ def pair_depth(
     return reproject(px, confidence, geometry, sizes, size_px, MIN_REPROJECTED)
 
 
-def fused_pairs(
-    depth: Tensor, sigma: Tensor, config: DepthFusionConfig
-) -> tuple[Tensor, Tensor, Tensor]:
+def fused_pairs(depth: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """As :func:`recon.stereo.reprojection.fuse` of pairs (P, h, w), with the noise they show."""
     noise = label_noise(depth, sigma)
-    is_refuted = ~(fuse(depth, sigma, config)[2] > 0).any()
-    out, error, views = fuse(depth, sigma * noise, config)
+    is_refuted = ~(fuse(depth, sigma)[2] > 0).any()
+    out, error, views = fuse(depth, sigma * noise)
     out, error = (torch.where(is_refuted, torch.nan, a) for a in (out, error))
     return out, error, torch.where(is_refuted, 0, views)
 

@@ -29,7 +29,12 @@ from recon.stereo.belief_propagation import (
 )
 from recon.stereo.matching_cost import CENSUS_OFFSETS, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
-from recon.stereo.reprojection import DepthFusionConfig
+from recon.stereo.reprojection import (
+    AGREE_SIGMAS,
+    MAX_SIGMA_SHARE,
+    MIN_SIGMA_SHARE,
+    SINGLE_VIEW_SIGMA,
+)
 from recon.stereo.upsampling import RANGE_FLOOR, UpsamplingConfig
 
 PIXELS = 128  # pixels of one program that holds one number each
@@ -816,7 +821,7 @@ def reproject_kernel(
     tl.store(sigma + at, tl.where(good, error, float("nan")).to(tl.float32), mask=here)
 
 
-def fuse(depth: Tensor, sigma: Tensor, config: DepthFusionConfig) -> tuple[Tensor, Tensor, Tensor]:
+def fuse(depth: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Depth, sigma (h, w) float32 and number of views uint8 of pairs (P, h, w); no view: NaN.
 
     As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees,
@@ -829,8 +834,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: DepthFusionConfig) -> tuple[Tenso
     balance = torch.zeros(1, dtype=torch.int32, device=device)
     fuse_kernel[(blocks(plane, FUSED_PIXELS),)](
         depth.contiguous(), sigma.contiguous(), out, error, views, balance, plane,
-        config.agree_sigmas, config.max_sigma_share, config.single_view_sigma,
-        config.min_sigma_share, pairs, FUSED_PIXELS,
+        AGREE_SIGMAS, MAX_SIGMA_SHARE, SINGLE_VIEW_SIGMA, MIN_SIGMA_SHARE, pairs, FUSED_PIXELS,
     )  # fmt: skip
     refute_kernel[(blocks(plane, FUSED_PIXELS),)](out, error, views, balance, plane, FUSED_PIXELS)
     return out, error, views

@@ -39,7 +39,6 @@ from recon.posegraph.pose_priors import check_prior
 from recon.posegraph.trajectory import Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
-from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.frame import CONTRADICTED, NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
@@ -188,11 +187,8 @@ class Mapper:
             min_base_to_height=selection.min_base_to_height, width_px=config.stereo_width_px,
             guided=config.upsample, labels=config.labels,
         )  # fmt: skip
-        dense = DenseStages(
-            BeliefPropagationConfig(iterations=config.iterations),
-            UpsamplingConfig(),
-            DepthFusionConfig(),
-        )
+        matching = BeliefPropagationConfig(iterations=config.iterations)
+        dense = DenseStages(matching, UpsamplingConfig())
         self.stereo = DenseStereo(backend, stereo, dense, self.rejected, self.debug, timing)
         self._first_stereo: DenseStereo | None = None
         if config.first_depths:

@@ -140,7 +140,7 @@ class DenseStereo:
             with self._timing("fuse"):
                 found = [*depths.values()]
                 self._noise = label_noise(found) or self._noise
-                depth = fuse(found, K, T_odom_camera, self._dense.fusion, self._noise)
+                depth = fuse(found, K, T_odom_camera, self._noise)
         if depth is None:
             return None, NO_IMAGE
         bgr = cv2.resize(at_middle_row(view.image, view.bgr), size_px, interpolation=cv2.INTER_AREA)

@@ -188,15 +188,10 @@ def _close_gaps(depth: Any, sigma: Any, out_depth: Any, out_sigma: Any) -> None:
                     break
 
 
-@dataclass(frozen=True, slots=True)
-class DepthFusionConfig:
-    """Parameters of the fusion of stereo pairs."""
-
-    agree_sigmas: float = 2.5  # pairs agree within that many combined sigmas
-    single_view_sigma: float = 1.5  # factor on the sigma of a point that one pair saw alone
-    max_sigma_share: float = 0.04  # of the depth; a worse reading says nothing
-    min_sigma_share: float = 0.0005  # of the depth; no pair is better than this
-
+AGREE_SIGMAS = 2.5  # pairs agree within that many combined sigmas
+SINGLE_VIEW_SIGMA = 1.5  # factor on the sigma of a point that one pair saw alone
+MAX_SIGMA_SHARE = 0.04  # of the depth; a worse reading says nothing
+MIN_SIGMA_SHARE = 0.0005  # of the depth; no pair is better than this
 
 NOISE_STRIDE, MIN_COMMON = 3, 500
 """Pixels from one sample of two pairs' difference to the next, and samples that two pairs share at
@@ -235,19 +230,13 @@ def label_noise(pairs: Sequence[PairDepth]) -> float | None:
     return float(np.clip(noise, 1.0, MAX_NOISE))
 
 
-def fuse(
-    pairs: Sequence[PairDepth],
-    K: F64,
-    T_world_camera: F64,
-    config: DepthFusionConfig,
-    noise: float = 1.0,
-) -> DepthMap:
+def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, noise: float = 1.0) -> DepthMap:
     """One depth map of all pairs: at each pixel the largest group that agrees, averaged.
 
     The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2; the
     sigma is the larger of the propagated one and the spread inside the group. ``noise``, at least
     1, multiplies all sigmas. ``views`` counts the group. Where several pairs read and none comes
-    within ``max_sigma_share`` of another nothing is known. Where that is so at more pixels than
+    within MAX_SIGMA_SHARE of another nothing is known. Where that is so at more pixels than
     those at which two agree within usual sigmas, what they see is not a rigid surface, or their
     motion is false, which no noise excuses, and the whole map is unknown.
     """
@@ -255,24 +244,19 @@ def fuse(
     sigma = np.stack([p.sigma_m for p in pairs])
     if noise > 1.0:
         rows = [np.ascontiguousarray(a[:, ::NOISE_STRIDE]) for a in (depth, sigma)]
-        if _fused(rows[0], rows[1], K, T_world_camera, config).views.any():  # not refuted
+        if _fused(rows[0], rows[1], K, T_world_camera).views.any():  # not refuted
             sigma *= np.float32(noise)
-    return _fused(depth, sigma, K, T_world_camera, config)
+    return _fused(depth, sigma, K, T_world_camera)
 
 
-def _fused(
-    depth: F32, sigma: F32, K: F64, T_world_camera: F64, config: DepthFusionConfig
-) -> DepthMap:
+def _fused(depth: F32, sigma: F32, K: F64, T_world_camera: F64) -> DepthMap:
     """As :func:`fuse`, of depths and sigmas (P, h, w)."""
     shape = depth.shape[1:]
     out = DepthMap(
         np.empty(shape, np.float32), np.empty(shape, np.float32), np.zeros(shape, np.uint8), K,
         T_world_camera,
     )  # fmt: skip
-    parallel_for(
-        _fuse, shape[0], depth, sigma, config.agree_sigmas, config.single_view_sigma,
-        config.max_sigma_share, config.min_sigma_share, out.depth_m, out.sigma_m, out.views,
-    )  # fmt: skip
+    parallel_for(_fuse, shape[0], depth, sigma, out.depth_m, out.sigma_m, out.views)
     contradicted = np.isnan(out.depth_m) & (out.views > 0)
     refuted = np.count_nonzero(contradicted) > np.count_nonzero(out.views >= 2)
     out.views[contradicted | refuted] = 0
@@ -282,10 +266,10 @@ def _fused(
 
 
 @njit(cache=True, nogil=True)
-def _largest_group(inverse: Any, sigma: Any, count: int, agree_sigmas: float) -> int:
+def _largest_group(inverse: Any, sigma: Any, count: int) -> int:
     """The reading that most others agree with; ties go to the smaller sigma."""
     best, most = 0, -1
-    square = agree_sigmas * agree_sigmas
+    square = AGREE_SIGMAS * AGREE_SIGMAS
     for i in range(count):
         support = 0
         for j in range(count):
@@ -298,20 +282,10 @@ def _largest_group(inverse: Any, sigma: Any, count: int, agree_sigmas: float) ->
 
 @njit(cache=True, nogil=True)
 def _fuse(
-    begin: int,
-    end: int,
-    depth: Any,
-    sigma: Any,
-    agree_sigmas: float,
-    single_view: float,
-    max_share: float,
-    min_share: float,
-    out_depth: Any,
-    out_sigma: Any,
-    out_views: Any,
+    begin: int, end: int, depth: Any, sigma: Any, out_depth: Any, out_sigma: Any, out_views: Any
 ) -> None:
     P, _, width = depth.shape
-    square = agree_sigmas * agree_sigmas
+    square = AGREE_SIGMAS * AGREE_SIGMAS
     for v in range(begin, end):
         w = np.empty(P)
         s = np.empty(P)
@@ -321,13 +295,13 @@ def _fuse(
             count = 0
             for p in range(P):
                 z, e = float(depth[p, v, u]), float(sigma[p, v, u])
-                if z > 0 and e < max_share * z:
+                if z > 0 and e < MAX_SIGMA_SHARE * z:
                     w[count] = 1.0 / z
                     s[count] = e / (z * z)
                     count += 1
             if count == 0:
                 continue
-            centre = _largest_group(w, s, count, agree_sigmas)
+            centre = _largest_group(w, s, count)
             total = mean = squares = 0.0
             views = 0
             for p in range(count):
@@ -342,16 +316,16 @@ def _fuse(
             if views == 1 and count > 1:
                 near = 0
                 for p in range(count):
-                    near += abs(w[p] - w[centre]) <= max_share * w[centre]
+                    near += abs(w[p] - w[centre]) <= MAX_SIGMA_SHARE * w[centre]
                 if near == 1:
                     continue
             mean /= total  # from the centre, as small numbers lose nothing when squared
             spread = max(squares / total - mean * mean, 0.0)
             variance = 1.0 / total + spread / max(views - 1, 1)
             z = 1.0 / (w[centre] + mean)
-            e = np.sqrt(variance) * z * z * (single_view if views == 1 else 1.0)
+            e = np.sqrt(variance) * z * z * (SINGLE_VIEW_SIGMA if views == 1 else 1.0)
             out_depth[v, u] = z
-            out_sigma[v, u] = max(e, min_share * z)
+            out_sigma[v, u] = max(e, MIN_SIGMA_SHARE * z)
 
 
 TILT_SIGMAS = 2.0

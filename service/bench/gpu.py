@@ -11,7 +11,6 @@ import numpy as np
 from recon.backends import Backend, DenseStages, load_backend
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import DepthMap, StereoPair
 from service.bench import BenchOptions, BenchResult, compare
@@ -64,7 +63,7 @@ def calls(backend: Backend, compiled: Backend, options: BenchOptions) -> list[Be
 
 def clouds(backend: Backend, options: BenchOptions) -> list[BenchResult]:
     """The fused depth of some pairs, without leaving the device in between."""
-    stages = DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), DepthFusionConfig())
+    stages = DenseStages(BeliefPropagationConfig(), UpsamplingConfig())
     pair, K = flown_pair(DEPTH), camera(DEPTH)
     size = f"{DEPTH[0]}x{DEPTH[1]} from pairs of {SIZE[0]}x{SIZE[1]}"
     return [

@@ -26,7 +26,7 @@ from recon.backends.torch_plan import Plan, part
 from recon.backends.triton_dense import drop_unreliable, drop_unseen, fuse, reproject, stereo
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, DepthFusionConfig
+from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import Array, StereoPair
 from service.bench import BenchOptions, BenchResult, compare
@@ -251,7 +251,7 @@ def dense_stages(device: str, pair: StereoPair, matching: BeliefPropagationConfi
     )
     z, sigma = (t.cpu().numpy() for t in depth.run())
     fused = planned(
-        device, lambda a, b: fuse(a, b, DepthFusionConfig()), np.stack([z] * PAIRS),
+        device, lambda a, b: fuse(a, b), np.stack([z] * PAIRS),
         np.stack([sigma] * PAIRS),
     )  # fmt: skip
     taps, pixels = upsampling.diameter_px**2, w * h
@@ -272,7 +272,7 @@ def dense_stages(device: str, pair: StereoPair, matching: BeliefPropagationConfi
 def whole_path(device: str, pair: StereoPair, matching: BeliefPropagationConfig) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then images up and depth down, and four."""
     assert pair.guide is not None
-    stages = DenseStages(matching, UpsamplingConfig(), DepthFusionConfig())
+    stages = DenseStages(matching, UpsamplingConfig())
     path = DensePath(device, stages)
     H, W = pair.guide.shape[:2]
     K = camera((W, H))

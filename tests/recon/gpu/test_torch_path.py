@@ -20,7 +20,7 @@ import pytest
 from recon.backends import DenseStages
 from recon.stereo import belief_propagation as compiled
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import MIN_CONFIDENCE, DepthFusionConfig, PairDepth
+from recon.stereo.reprojection import MIN_CONFIDENCE, PairDepth
 from recon.stereo.reprojection import fuse as compiled_fuse
 from recon.stereo.reprojection import label_noise as compiled_noise
 from recon.stereo.reprojection import reproject as compiled_reproject
@@ -33,7 +33,6 @@ torch = pytest.importorskip("torch")
 
 SIZE = (96, 54)
 K = np.array([[100.0, 0, 47.5], [0, 100.0, 26.5], [0, 0, 1]])
-ALL = DepthFusionConfig()
 QUICK = BeliefPropagationConfig(iterations=1, levels=2, speckle_px=4)
 """For the interpreter."""
 SMALL = 0.08
@@ -179,11 +178,11 @@ def test_fusion_equals_the_compiled_one(device: str, count: int, times: int) -> 
         for d in some_depths(count)
     ]
     noise = compiled_noise(pairs) or 1.0
-    want = compiled_fuse(pairs, K, np.eye(4), ALL, noise)
+    want = compiled_fuse(pairs, K, np.eye(4), noise)
     z, error = on(
         device, np.stack([d.depth_m for d in pairs]), np.stack([d.sigma_m for d in pairs])
     )
-    depth, sigma, views = (t.cpu().numpy() for t in fused_pairs(z, error, ALL))
+    depth, sigma, views = (t.cpu().numpy() for t in fused_pairs(z, error))
     same = views == want.views
     if noise == 1.0:
         assert same.all()
@@ -244,7 +243,7 @@ def by_stages(pairs: list[StereoPair], matching: BeliefPropagationConfig) -> Dep
         if pair.guide is not None:
             found = compiled_upsample(found, pair.guide, UpsamplingConfig())
         depths.append(compiled_reproject(found, pair, K, SIZE))
-    return compiled_fuse(depths, K, np.eye(4), ALL, compiled_noise(depths) or 1.0)
+    return compiled_fuse(depths, K, np.eye(4), compiled_noise(depths) or 1.0)
 
 
 def pairs_for(device: str, guide: int) -> list[StereoPair]:
@@ -261,7 +260,7 @@ def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
     from recon.backends.torch_depth import DensePath
 
     matching = BeliefPropagationConfig() if device == "cuda" else QUICK
-    path = DensePath(device, DenseStages(matching, UpsamplingConfig(), ALL))
+    path = DensePath(device, DenseStages(matching, UpsamplingConfig()))
     pairs = pairs_for(device, guide)
     for chosen in (pairs, pairs[:1], pairs[::-1]) if device == "cuda" else (pairs,):
         want = by_stages(chosen, matching)
@@ -276,7 +275,7 @@ def test_the_path_needs_a_pair(device: str) -> None:
     from recon.backends.torch_depth import DensePath
 
     with pytest.raises(ValueError, match="no stereo pair"):
-        path = DensePath(device, DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), ALL))
+        path = DensePath(device, DenseStages(BeliefPropagationConfig(), UpsamplingConfig()))
         path.depth([], K, SIZE, np.eye(4))
 
 
@@ -285,7 +284,7 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     from recon.backends.torch_backend import TorchBackend
     from service.compute.backend_choice import FallbackBackend
 
-    stages = DenseStages(QUICK, UpsamplingConfig(), ALL)
+    stages = DenseStages(QUICK, UpsamplingConfig())
     pair = pairs_for(device, 0)[0]
     own = TorchBackend(device)
     backend = FallbackBackend(own)

@@ -17,7 +17,6 @@ import pytest
 from recon.backends import DenseStages
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import U8, DepthMap, StereoPair
 
@@ -121,7 +120,6 @@ def test_a_keyframe_from_images_to_fused_depth(device: str, reads: list[int]) ->
     stages = DenseStages(
         BeliefPropagationConfig(iterations=1, levels=1, speckle_px=4),
         UpsamplingConfig(diameter_px=3),
-        DepthFusionConfig(),
     )  # fmt: skip
     backend = TorchBackend(device)
     reads.clear()

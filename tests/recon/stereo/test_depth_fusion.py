@@ -19,7 +19,6 @@ from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import (
     MAX_NOISE,
     PAIRS_CORRELATION,
-    DepthFusionConfig,
     PairDepth,
     fuse,
     label_noise,
@@ -40,7 +39,7 @@ def test_sigma_is_honest_for_gaussian_readings() -> None:
     rng = np.random.default_rng(0)
     truth = np.full(SHAPE, 60.0, np.float32)
     pairs = [reading(rng, truth, s) for s in (0.2, 0.3, 0.4)]
-    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig())
+    fused = fuse(pairs, K, np.eye(4))
     within = np.abs(fused.depth_m - truth) <= fused.sigma_m
     assert 0.6 < within.mean() < 0.85
     assert np.median(fused.sigma_m) < 0.2
@@ -52,7 +51,7 @@ def test_the_majority_wins_over_one_wrong_reading() -> None:
     truth = np.full(SHAPE, 60.0, np.float32)
     wrong = reading(rng, truth - 12.0, 0.1)
     pairs = [reading(rng, truth, 0.3), wrong, reading(rng, truth, 0.3)]
-    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig())
+    fused = fuse(pairs, K, np.eye(4))
     # Where the two right ones miss each other by over 2.5 sigma (1 in 80) there is none.
     assert np.mean(np.abs(fused.depth_m - truth) < 2.0) > 0.97
     assert (fused.views <= 2).all()
@@ -64,7 +63,7 @@ def test_what_no_pair_knows_stays_unknown_and_single_views_are_marked() -> None:
     a, b = reading(rng, truth, 0.3), reading(rng, truth, 0.3)
     a.depth_m[:, :40] = np.nan
     b.depth_m[:20] = np.nan
-    fused = fuse([a, b], K, np.eye(4), DepthFusionConfig())
+    fused = fuse([a, b], K, np.eye(4))
     assert np.isnan(fused.depth_m[:20, :40]).all() and (fused.views[:20, :40] == 0).all()
     assert (fused.views[:20, 40:] == 1).all()
     single, double = fused.sigma_m[:20, 40:], fused.sigma_m[20:, 40:]
@@ -77,7 +76,7 @@ def test_readings_that_contradict_each_other_are_dropped() -> None:
     a, b = reading(rng, truth, 0.3), reading(rng, truth, 0.3)
     b.depth_m[:, :10] += 12.0
     b.depth_m[:, 10:20] = a.depth_m[:, 10:20] + 2.0  # more than 2.5 sigma, less than 4 %
-    fused = fuse([a, b], K, np.eye(4), DepthFusionConfig())
+    fused = fuse([a, b], K, np.eye(4))
     assert np.isnan(fused.depth_m[:, :10]).all() and np.isnan(fused.sigma_m[:, :10]).all()
     assert (fused.views[:, :10] == 0).all()
     assert np.isfinite(fused.depth_m[:, 10:]).mean() > 0.97
@@ -92,16 +91,16 @@ def test_pairs_that_mostly_contradict_each_other_give_nothing() -> None:
     for pair in pairs:
         pair.depth_m[:, :20] = 60.0
     pairs[0].depth_m[:5] = pairs[1].depth_m[:5] = np.nan
-    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig())
+    fused = fuse(pairs, K, np.eye(4))
     assert np.isnan(fused.depth_m).all() and np.isnan(fused.sigma_m).all()
     assert (fused.views == 0).all()
-    few = fuse(pairs[2:], K, np.eye(4), DepthFusionConfig())
+    few = fuse(pairs[2:], K, np.eye(4))
     assert np.isfinite(few.depth_m).all()  # one pair alone contradicts none
 
 
 def test_useless_readings_are_left_out() -> None:
     far = PairDepth(np.full(SHAPE, 60.0, np.float32), np.full(SHAPE, 30.0, np.float32))
-    fused = fuse([far], K, np.eye(4), DepthFusionConfig())
+    fused = fuse([far], K, np.eye(4))
     assert np.isnan(fused.depth_m).all()
 
 
@@ -124,7 +123,7 @@ def test_noise_of_labels_is_how_far_pairs_of_a_view_disagree(times: float) -> No
     assert noise is not None and noise == pytest.approx(times, rel=0.1)
     assert label_noise(pairs[:1]) is None
     assert label_noise([PairDepth(p.depth_m[:30, :30], p.sigma_m[:30, :30]) for p in pairs]) is None
-    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig(), noise)
+    fused = fuse(pairs, K, np.eye(4), noise)
     off = np.abs(fused.depth_m - truth)[20:, 100:]
     assert 0.6 < np.mean(off <= fused.sigma_m[20:, 100:]) < 0.8
     assert np.mean(fused.views[20:, 100:] == 4) > 0.9  # right sigmas: none is left out
@@ -148,7 +147,7 @@ def test_no_sigma_makes_a_surface_of_a_false_motion(scatter: float, is_kept: boo
     pairs = [PairDepth(depth, np.full(depth.shape, 0.3, np.float32)) for depth in depths]
     noise = label_noise(pairs)
     assert noise is not None and (is_kept or noise == MAX_NOISE)
-    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig(), min(noise, 7.0))
+    fused = fuse(pairs, K, np.eye(4), min(noise, 7.0))
     assert bool(np.isfinite(fused.depth_m).any()) == is_kept
     assert bool(fused.views.any()) == is_kept
 
@@ -169,7 +168,7 @@ def test_sigma_holds_however_much_the_images_are_compressed(quality: int, most: 
     T = images[0].T_odom_camera
     ground = on_plane(K_IMAGE, SIZE, T)[::997]
     view = view_at(0, T, image=images[0], partners=images[1:], points=ground)
-    dense = DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), DepthFusionConfig())
+    dense = DenseStages(BeliefPropagationConfig(), UpsamplingConfig())
     config = VirtualStereoConfig(width_px=240, guided=False)
     depth, _ = DenseStereo(CpuBackend(), config, dense, Counter(), None, untimed)(view)
     assert depth is not None
