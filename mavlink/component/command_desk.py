@@ -53,8 +53,6 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command's handler and its rules."""
-
     components: frozenset[int]  # our components that accept it
     window_s: float  # within it a repetition is a retransmission; 0 for queries
     handle: Callable[[Call, Any], Handled | None]  # None: not for this component
@@ -182,7 +180,6 @@ class CommandDesk:
             self._last = _Done(key, answer, now_ns + window_ns)
 
     def cancel(self, number: int, now_ns: int) -> None:
-        """Cancel running work of this number."""
         for running in self._running.values():
             if running.call.number == number:
                 running.work.cancel()

@@ -219,7 +219,6 @@ class Companion:
         return self._outbox.take()
 
     def tick(self, now_ns: int) -> None:
-        """Send what is due and evaluate what arrived."""
         self._now_ns = max(self._now_ns, now_ns)
         self.presence.look(now_ns)
         self.autopilot.follow()
@@ -283,7 +282,6 @@ class Companion:
         return True
 
     def send_interval(self, component: int, number: int, link: int) -> None:
-        """Send the MESSAGE_INTERVAL of a message that is streamed."""
         interval_us = self.streams[component, number].interval_us
         message = dialect.MAVLink_message_interval_message(number, interval_us)
         self._outbox.put(component, message, link)

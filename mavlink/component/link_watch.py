@@ -61,8 +61,6 @@ class Trouble:
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """The messages expected on the links, and how long to wait for them."""
-
     gimbal: bool | None = None  # True: its angles are required; None: optional
     wait_s: float = 10.0
     ground_wait_s: float = 60.0  # ground stations join later and leave radio range

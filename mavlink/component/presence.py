@@ -36,8 +36,6 @@ class Health(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class PresenceConfig:
-    """Our settings on the network."""
-
     system: int | None = None  # None: that of our vehicle
     latch_s: float = 3.0  # how long to wait for the vehicle of the last flight
     stale_s: float = 5.0  # health not confirmed for this long is CRITICAL

@@ -53,8 +53,6 @@ TUNNEL_ROOM = 128
 
 @dataclass(frozen=True, slots=True)
 class VehicleConfig:
-    """Links and our settings on them."""
-
     links: tuple[str, ...] = ()
     presence: PresenceConfig = field(default_factory=PresenceConfig)
     companion: CompanionConfig = field(default_factory=CompanionConfig)
@@ -313,7 +311,6 @@ class VehicleLink:
             self._stop.wait(max(0.001, (self.presence.next_ns - self._clock_ns()) / S))
 
     def _send_beats(self, beats: list[OutgoingMessage], now_ns: int) -> None:
-        """Send heartbeats that are due, and plan the next ones."""
         system, stand_in = self.presence.system, self._stand_in
         if beats and stand_in is not None:
             self._links.skip(stand_in.sent())

@@ -43,8 +43,6 @@ PATIENCE_S = 0.3  # live: a little more than the 3.5 Hz of a slow telemetry radi
 
 @dataclass(frozen=True, slots=True)
 class HistoryConfig:
-    """How long samples are kept, and how gimbal messages are read."""
-
     keep_s: float = math.inf
     yaw_frame: str = "auto"  # auto: as a gimbal's flags declare, unless telemetry refutes them
 

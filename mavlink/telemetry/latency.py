@@ -74,8 +74,6 @@ class _Turns:
 
 
 class LatencyWatch:
-    """Collects rotations between frames and estimates the latency."""
-
     def __init__(self) -> None:
         self._frames: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)  # run, time, turned
         self._run = 0
@@ -151,7 +149,6 @@ class LatencyWatch:
         return None if fit is None or fit.agreement(seen) < MIN_CORRELATION else found
 
     def _about(self, track: Attitudes, about_s: float) -> LatencyEstimate | None:
-        """The latency within ``REACH_S`` of ``about_s``."""
         seen = self._turns(track)
         return self._of(seen, track, about_s)
 

@@ -23,8 +23,6 @@ sheets of u-blox M8 receivers, is 2.1 m per axis; heights are about 1.7 times wo
 
 
 class GimbalFrame(Enum):
-    """Reference frame of a gimbal's quaternion."""
-
     EARTH = "earth"  # NED
     VEHICLE = "vehicle"  # horizon in roll and pitch, the vehicle's heading in yaw
     BODY = "body"  # the vehicle's own axes

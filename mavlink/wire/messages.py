@@ -127,7 +127,6 @@ class Stream:
         self._next_ns = 0
 
     def end(self) -> None:
-        """Forget the subscribers."""
         self._wanted.clear()
 
     def tick(self, now_ns: int) -> None:

@@ -37,7 +37,6 @@ class LinkSpec:
 
     @property
     def name(self) -> str:
-        """The address as it is written."""
         return f"{self.kind}:{self.place}:{self.number}"
 
 
@@ -183,7 +182,6 @@ class TcpPort:
             self._peers[0].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def read(self) -> bytes:
-        """Received data of any peer."""
         data = b""
         for source in _ready([*self._servers, *self._peers]):
             if source in self._servers:
@@ -259,7 +257,6 @@ class LinesPort(UdpPort):
         self._reader = LineReader()
 
     def read(self) -> bytes:
-        """The packets of the next datagram."""
         data = super().read()
         return self._reader.packets(data, time.monotonic_ns()) if data else b""
 

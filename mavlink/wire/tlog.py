@@ -88,7 +88,6 @@ class TlogRecorder:
             self._unix_minus_monotonic_ns = unix_offset_ns
 
     def close(self) -> None:
-        """End the log, if one is open."""
         with self._lock:
             self._close()
 

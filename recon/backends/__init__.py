@@ -22,15 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DenseStages:
-    """The parameters of the stages from a rectified pair to fused depth."""
-
     matching: BeliefPropagationConfig
     upsampling: UpsamplingConfig
 
 
 class Backend(Protocol):
-    """Operations that a backend offers to the pipeline."""
-
     @property
     def name(self) -> str: ...
 

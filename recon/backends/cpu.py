@@ -30,13 +30,11 @@ class CpuBackend:
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
-        """Labels of the left view, (h, w); Eq. 1."""
         from recon.stereo.belief_propagation import belief_propagation
 
         return belief_propagation(left, right, labels, config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
-        """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         from recon.stereo.upsampling import upsample
 
         return upsample(coarse, guide, config)
@@ -44,7 +42,6 @@ class CpuBackend:
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
-        """Projective point-to-plane ICP from the given start."""
         from recon.mapping.registration import register_projective
 
         return register_projective(source, target, T_target_source, config)

@@ -52,7 +52,6 @@ class TorchBackend:
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
-        """Labels of the left view, (h, w); Eq. 1."""
         check_pair(left, right, labels)
         right = equalised(left, right, labels, config.min_disparity)
         h, w = left.shape
@@ -68,7 +67,6 @@ class TorchBackend:
         return drop_unreliable(left, px, confidence, config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
-        """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         check_guide(coarse, guide)
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
         small, large = padded(h, w, 1)[:2], padded(H, W, 1)[:2]
@@ -83,7 +81,6 @@ class TorchBackend:
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
-        """Projective point-to-plane ICP from the given start."""
         from recon.backends.torch_icp import DeviceIcp
 
         if self._icp is None:
@@ -98,7 +95,6 @@ class TorchBackend:
         T_world_camera: F64,
         stages: DenseStages,
     ) -> DepthMap:
-        """Depth of a keyframe without leaving the device."""
         if self._path is None or self._path.stages != stages:
             self._path = DensePath(self.device, stages)
         return self._path.depth(pairs, K, size_px, T_world_camera)

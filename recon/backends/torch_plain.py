@@ -43,7 +43,6 @@ class PlainTorchBackend(CpuBackend):
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
-        """Labels of the left view, (h, w); Eq. 1."""
         check_pair(left, right, labels)
         right = equalised(left, right, labels, config.min_disparity)
         with torch.inference_mode():

@@ -60,8 +60,6 @@ class CalibrationConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A fitted camera and how well it is known."""
-
     camera: Camera
     rms_px: float  # over all corners of the views used
     used: tuple[str, ...]
@@ -199,7 +197,6 @@ def _warnings(
     distortion: F64,
     size_px: tuple[int, int],
 ) -> tuple[str, ...]:
-    """Reasons why the result is weak, in words for the operator."""
     out = []
     if len(views) < 10:
         out.append(f"only {len(views)} views were used; 15 or more give a more accurate result")

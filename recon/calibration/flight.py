@@ -49,8 +49,6 @@ RAYLEIGH_MEDIAN = 1.1774  # median length of an error whose coordinates have sig
 
 @dataclass(frozen=True, slots=True)
 class SelfCalibrationConfig:
-    """Limits for the camera's error, and requirements on the flight."""
-
     sigma_focal: float = 0.05  # of the focal length beforehand, as a share
     sigma_aspect: float = 5e-4  # of height over width of a pixel: one focal length holds for both
     sigma_centre: float = 0.015  # of the centre, as a share of the width
@@ -70,8 +68,6 @@ class SelfCalibrationConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelfCalibrated:
-    """The camera estimated from a flight, and how well it is determined."""
-
     camera: Camera
     sigma_focal: float  # as a share
     sigma_k: tuple[float, float]
@@ -212,8 +208,6 @@ ROUNDS: tuple[tuple[float, float], ...] = ((8.0, 180.0), (1.0, 15.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """A flight's views tied by their landmarks."""
-
     solution: Solution
     seen: Sightings  # that took part
     sigma_px: float  # of a coordinate, as they scatter

@@ -118,8 +118,6 @@ def _of_rows(T: F64, turns: F64, moves: F64, share: F64) -> F64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The adjusted flight."""
-
     poses: F64  # (N, 4, 4) T_world_camera
     points: F64  # (P, 3) world, m; NaN where neither rays nor a survey place one
     camera: Camera

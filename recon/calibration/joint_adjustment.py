@@ -54,8 +54,6 @@ class Turning:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointAdjustment:
-    """The adjusted stills."""
-
     camera: Camera  # with its shutter
     poses: F64  # (N, 4, 4) T_world_camera of the middle rows
     points: F64  # (P, 3) world, m

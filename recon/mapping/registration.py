@@ -48,8 +48,6 @@ MAX_DISAGREEMENT = 4.0  # chi-square per degree of freedom against the images' m
 
 @dataclass(frozen=True, slots=True)
 class IcpConfig:
-    """Parameters of the alignment."""
-
     strides: tuple[int, ...] = (6, 3)  # pixels between the source points, level by level
     iterations: tuple[int, ...] = (8, 6)  # of each level, at most
     max_step_share: float = 0.05  # correction over the median depth, else rejected
@@ -66,8 +64,6 @@ def arrays_of(depth: DepthMap) -> tuple[F32, F32, F64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthSurface:
-    """A depth map with its surface elements."""
-
     elements: F32  # (h, w, 6), see recon.mapping.icp_kernels
     intrinsics: F64  # (4,) fx fy cx cy
     centre: F64  # (3,) m, mean of the surface in the camera frame

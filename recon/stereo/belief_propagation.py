@@ -54,8 +54,6 @@ UNKNOWN = -32768  # where there is no label; none within 1024 comes near it
 
 @dataclass(frozen=True, slots=True)
 class BeliefPropagationConfig:
-    """How the labels are found and which of them are accepted."""
-
     iterations: int = 5  # per level; one iteration updates one colour of the checkerboard
     levels: int = 5  # of the pyramid; fewer when the image is small
     smoothness_truncation: float = 2.5  # labels; a larger jump costs no more

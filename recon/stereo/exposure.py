@@ -149,7 +149,6 @@ def _match(
 
 @njit(cache=True, nogil=True)
 def _apply(begin: int, end: int, right: Any, change: Any, out: Any) -> None:
-    """Add the change to each gray level."""
     height, width = right.shape
     one, half, most = np.float32(1), np.float32(0.5), np.float32(255)
     for v in range(begin, end):

@@ -38,7 +38,6 @@ class Lanes:
         return lanes if stored == self.type else self.builder.zext(lanes, self.type)
 
     def save(self, value: Any, address: Any) -> None:
-        """Put the lanes at an address."""
         pointer = self.builder.inttoptr(address, self.type.as_pointer())
         self.builder.store(value, pointer, align=1)
 
@@ -81,11 +80,9 @@ class Lanes:
         )
 
     def least(self, a: Any, b: Any) -> Any:
-        """The lesser of each lane."""
         return self.builder.select(self._compare("<", a, b), a, b)
 
     def most(self, a: Any, b: Any) -> Any:
-        """The greater of each lane."""
         return self.builder.select(self._compare(">", a, b), a, b)
 
     def _compare(self, how: str, a: Any, b: Any) -> Any:

@@ -12,8 +12,6 @@ from recon.types import F64, U8
 
 @dataclass(frozen=True, slots=True)
 class VirtualStereoConfig:
-    """Parameters of pair selection and rectification."""
-
     min_base_to_height: float = 0.03  # baseline over distance
     max_base_to_height: float = 0.8
     min_overlap: float = 0.25  # share of the left view that the right one sees

@@ -73,8 +73,6 @@ The images of that time are kept: the next one to start from is seconds away."""
 
 @dataclass(frozen=True, slots=True)
 class LiveConfig:
-    """When a live camera counts as lost, and how it is reopened."""
-
     open_s: float = 10.0  # no stream for this long: it cannot be opened
     stall_s: float = 3.0  # no image for this long: reopen
     frozen_s: float = 8.0  # the same image for this long: reopen

@@ -49,8 +49,6 @@ NO_YAW_RAD = 3.0  # sigma of an unknown heading
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A position on the globe with its uncertainty."""
-
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float | None

@@ -154,7 +154,6 @@ class DaemonLink:
             PROCESS.start("backlog closing", lambda _: sender.close())
 
     def configure(self, config: Config) -> None:
-        """Keep to another budget, also in flight."""
         for sender in (self.sender, self.backlog):
             if sender is not None:
                 sender.set_budget(config.datalink.budget_kbit_s, config.datalink.share)

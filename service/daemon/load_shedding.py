@@ -164,7 +164,6 @@ def strains(readings: MachineReadings, config: ComputeConfig) -> list[Strain]:
 
 
 def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:
-    """``compute`` reduced to ``level``."""
     if level >= Level.LOWER_RATE:
         compute = replace(compute, pairs=max(1, compute.pairs // 2))
     if level >= Level.LOWER_RESOLUTION:

@@ -29,8 +29,6 @@ REPORT_EVERY = 25  # frames between two progress lines
 
 
 class SimulatedFlight:
-    """Camera, autopilot and folder of one simulated flight."""
-
     def __init__(
         self, source: str, render: Callable[[Path, dict[str, str]], None] | None = None
     ) -> None:

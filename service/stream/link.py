@@ -299,7 +299,6 @@ class DatalinkSender:
         ]
 
     def _serve(self, _: Worker) -> None:
-        """Send and answer on the open sessions until the stop."""
         while not self._stop.is_set():
             self._wake.clear()
             sessions = self._open_sessions

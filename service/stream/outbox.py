@@ -110,8 +110,6 @@ class LiveLane:
 
 @dataclass(slots=True, eq=False)
 class Request:
-    """Items of one kind that a ground station requested."""
-
     store: ScanStore
     ask: Ask
     kind: str
@@ -246,7 +244,6 @@ class Outbox:
     # Events
 
     def on_item(self, scan_id: str, kind: str, number: int, now: float) -> None:
-        """The store of ``scan_id`` has a new item."""
         feed = self._feeds.get(scan_id)
         if feed is None:
             return

@@ -51,7 +51,6 @@ class Planes:
 
 
 def planes_of(depth: DepthMap, bgr: U8, known: Bool) -> Planes:
-    """The planes of a depth map and its colour."""
     with np.errstate(invalid="ignore"):
         good = known & (depth.sigma_m > 0) & (depth.sigma_m < 1e6)
     sigma = depth.sigma_m if good.all() else np.where(good, depth.sigma_m, np.float32(0))

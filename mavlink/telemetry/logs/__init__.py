@@ -26,8 +26,6 @@ READERS: dict[str, str] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryLog:
-    """A log's history and what its reader reports."""
-
     history: VehicleHistory
     clock: str  # "unix", or "boot" when the log has no date, or "video": since the video's start
     first_ns: int
