@@ -18,6 +18,8 @@ from recon.tracking.robust_geometry import attempt
 from recon.types import F32, F64, U8, Camera
 
 MIN_VIEWS = 4
+OUTLIER_RATIO = 3.0  # of a view's rms to the median view's
+OUTLIER_FLOOR_PX = 0.5  # views better than this are never left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +49,6 @@ class BoardView:
 
     name: str
     corners_px: F32  # (N, 2), in the board's order
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationConfig:
-    """How a camera is fitted and which views are left out."""
-
-    tangential: bool = False
-    outlier_ratio: float = 3.0  # of a view's rms to the median view's
-    outlier_floor_px: float = 0.5  # views better than this are never left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,26 +95,22 @@ def _refined(gray: U8, corners: F32, pattern: tuple[int, int]) -> F32:
 
 
 def calibrate(
-    views: Sequence[BoardView],
-    board: Board,
-    size_px: tuple[int, int],
-    config: CalibrationConfig | None = None,
+    views: Sequence[BoardView], board: Board, size_px: tuple[int, int], tangential: bool = False
 ) -> Calibration | None:
     """The camera of ``size_px`` (W, H) that took the views, or None when it cannot be fitted.
     Raises ValueError for fewer than four views."""
-    config = config or CalibrationConfig()
     if len(views) < MIN_VIEWS:
         raise ValueError(f"{len(views)} views of the board are too few; at least {MIN_VIEWS}")
     kept = list(views)
     rejected: list[tuple[str, str]] = []
     while True:
-        fit = _fit(kept, board, size_px, config.tangential)
+        fit = _fit(kept, board, size_px, tangential)
         if fit is None:
             return None
         rms, K, distortion, sigma, per_view = fit
         usual = float(np.median(per_view))
         worst = int(np.argmax(per_view))
-        limit = max(config.outlier_ratio * usual, config.outlier_floor_px)
+        limit = max(OUTLIER_RATIO * usual, OUTLIER_FLOOR_PX)
         if per_view[worst] <= limit or len(kept) <= MIN_VIEWS:
             break
         reason = f"rms {per_view[worst]:.2f} px where the median view has {usual:.2f} px"
@@ -182,11 +171,8 @@ def _fit_terms(
 def _coverage(views: Sequence[BoardView], size_px: tuple[int, int]) -> float:
     """Share of 8x6 cells of the image that hold a corner."""
     uv = np.concatenate([view.corners_px for view in views])
-    cells = np.zeros((6, 8), bool)
-    i = np.clip((uv[:, 0] / size_px[0] * 8).astype(int), 0, 7)
-    j = np.clip((uv[:, 1] / size_px[1] * 6).astype(int), 0, 5)
-    cells[j, i] = True
-    return float(cells.mean())
+    cells = (uv / size_px * (8, 6)).astype(int).clip(0, (7, 5))
+    return len(np.unique(cells, axis=0)) / 48
 
 
 def _warnings(
@@ -213,14 +199,17 @@ def _warnings(
 
 def _monotonic(distortion: F64, K: F64, size_px: tuple[int, int]) -> bool:
     """True when the radial model grows all the way to the image's corner."""
-    k1, k2, k3 = distortion[0], distortion[1], distortion[4]
-    r = np.linspace(0.0, 4.0, 4000)
-    bent = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
-    turn = np.flatnonzero(np.diff(bent) <= 0)
-    reach = bent[turn[0]] if len(turn) else np.inf
     corner = max(
         float(np.hypot((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]))
         for u in (0, size_px[0] - 1)
         for v in (0, size_px[1] - 1)
     )
-    return bool(reach > corner)
+    return fold(distortion)[1] > corner
+
+
+def fold(distortion: F64) -> tuple[float, float]:
+    """Radius up to which the radial model grows, without and with it; (4, inf) if up to there."""
+    r = np.linspace(0.0, 4.0, 4000)
+    bent = r * (1 + distortion[0] * r**2 + distortion[1] * r**4 + distortion[4] * r**6)
+    turn = np.flatnonzero(np.diff(bent) <= 0)
+    return (float(r[turn[0]]), float(bent[turn[0]])) if len(turn) else (4.0, np.inf)

@@ -117,10 +117,13 @@ def self_calibrate(
     sigma = float(np.clip(np.median(first.errors_px) / RAYLEIGH_MEDIAN, 0.1, 2.0))
     seen = shared(seen, first.errors_px < config.gate_sigmas * sigma)
     last = replace(adjusted(problem, first), seen=seen, sigma_px=np.full(len(seen.view), sigma))
-    images, wider, at = by_images_alone(last, config)
+    alone_px, sigma_alone, wider, at = by_images_alone(last, config)
     found = solve(replace(at, camera_information=held).widened(wider), config.iterations)
     sigmas = camera_sigmas(found.camera_covariance)
-    focal = focal_sigma(found.camera, sigmas) * contradiction(images, camera, config)
+    # As much wider as the focal lengths by the images and as given are further apart than their
+    # sigmas. Birge 1932, doi:10.1103/PhysRev.40.207.
+    apart = abs(np.log(alone_px / camera.K[0, 0])) / np.hypot(sigma_alone, config.sigma_focal)
+    focal = focal_sigma(found.camera, sigmas) * max(float(apart), 1.0)
     why_not = doubt(found.camera, camera, sigmas, config)
     if not why_not and focal > config.max_sigma_focal:
         why_not = TOO_FAR
@@ -133,14 +136,6 @@ def self_calibrate(
     )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class FocalLength:
-    """A focal length with its relative sigma."""
-
-    px: float
-    sigma: float
-
-
 def thinned(seen: Sightings) -> Sightings:
     """Those of evenly chosen landmarks, :data:`MAX_SIGHTINGS` in all: patches of an image share
     their errors, so that more tell nothing more."""
@@ -150,9 +145,9 @@ def thinned(seen: Sightings) -> Sightings:
 
 def by_images_alone(
     problem: Problem, config: SelfCalibrationConfig
-) -> tuple[FocalLength, float, Problem]:
-    """The focal length without prior knowledge, by how much sightings have to be widened, and the
-    state adjusted to them.
+) -> tuple[float, float, float, Problem]:
+    """The focal length in px without prior knowledge, its relative sigma, by how much sightings
+    have to be widened, and the state adjusted to them.
 
     Errors that neighbouring sightings and views share pull the focal length of a flight straight
     down much further than the adjustment's covariance says. So its sigma is that of a jackknife,
@@ -169,7 +164,7 @@ def by_images_alone(
     spread = np.hypot(jackknife(at, config.iterations), np.log(focal / other))
     sigma = focal_sigma(found.camera, camera_sigmas(found.camera_covariance))
     wider = max(float(spread) / sigma, 1.0)
-    return FocalLength(focal, wider * sigma), wider, at
+    return focal, wider * sigma, wider, at
 
 
 def adjusted(problem: Problem, found: Solution) -> Problem:
@@ -193,13 +188,6 @@ def jackknife(problem: Problem, iterations: int = 40) -> float:
         found = solve(replace(problem, seen=rest, sigma_px=sigmas), iterations)
         focal.append(np.log(found.camera.K[0, 0]))
     return float(np.sqrt((PARTS - 1) * np.var(focal)))
-
-
-def contradiction(images: FocalLength, given: Camera, config: SelfCalibrationConfig) -> float:
-    """How much further than their sigmas the focal lengths by the images and as given are apart;
-    1 where they agree. Birge 1932, doi:10.1103/PhysRev.40.207."""
-    apart = abs(np.log(images.px / given.K[0, 0]))
-    return max(float(apart / np.hypot(images.sigma, config.sigma_focal)), 1.0)
 
 
 ROUNDS: tuple[tuple[float, float], ...] = ((8.0, 180.0), (1.0, 15.0))

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon.calibration.board import Board, BoardView, Calibration, find_board
-from recon.types import F32, F64, U8
+from recon.calibration.board import Board, BoardView, Calibration, find_board, fold
+from recon.types import F32, U8
 from service.errors import InputError
 from service.progress import Progress
 
@@ -137,15 +137,7 @@ def _draw_bent_grid(out: U8, calibration: Calibration, scale: float) -> None:
             rays = np.stack([u, v, np.ones_like(u)], axis=1) @ inverse.T
             r2 = rays[:, 0] ** 2 + rays[:, 1] ** 2
             line, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, camera.distortion)
-            ok = (r2 < _fold(camera.distortion)) & (np.abs(line[:, 0]) < 10 * W).all(axis=1)
+            ok = (r2 < fold(camera.distortion)[0] ** 2) & (np.abs(line[:, 0]) < 10 * W).all(axis=1)
             points = np.round(line[ok, 0] * scale).astype(np.int32)
             cv2.polylines(out, [points], False, (70, 70, 70), 1, cv2.LINE_AA)
     cv2.rectangle(out, (0, round(H * scale)), (out.shape[1], out.shape[0]), (28, 28, 28), -1)
-
-
-def _fold(distortion: F64) -> float:
-    """Squared radius up to which the radial model grows."""
-    r = np.linspace(0.0, 4.0, 2000)
-    bent = r * (1 + distortion[0] * r**2 + distortion[1] * r**4 + distortion[4] * r**6)
-    turn = np.flatnonzero(np.diff(bent) <= 0)
-    return float(r[turn[0]] ** 2) if len(turn) else 16.0

@@ -28,7 +28,7 @@ def calibrate(
     """
     import cv2
 
-    from recon.calibration.board import MIN_VIEWS, Board, CalibrationConfig
+    from recon.calibration.board import MIN_VIEWS, Board
     from recon.calibration.board import calibrate as fit
     from service.cameras.board_images import draw_coverage, find_boards
     from service.cameras.camera_file import save_camera
@@ -50,7 +50,7 @@ def calibrate(
                 f"is --pattern {pattern} the number of inner corners?"
             )
         progress(f"fitting the camera to {len(boards.views)} views")
-        result = fit(boards.views, board, boards.size_px, CalibrationConfig(tangential))
+        result = fit(boards.views, board, boards.size_px, tangential)
     if result is None:
         raise InputError("no camera fits these views; take the board from different angles")
     record = {

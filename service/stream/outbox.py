@@ -55,21 +55,15 @@ class LiveLane:
     """New items to send unrequested; holds at most ``room``, then drops the oldest."""
 
     def __init__(self, room: int) -> None:
-        self._room = room
-        self._queue: deque[tuple[ScanStore, str, int]] = deque()
+        self._queue: deque[tuple[ScanStore, str, int]] = deque(maxlen=room)
         self._messages: deque[Outgoing] = deque()
         self._current: tuple[ScanStore, str, int] | None = None
-        self.skipped = 0  # dropped items
 
     def push(self, store: ScanStore, kind: str, number: int) -> None:
         self._queue.append((store, kind, number))
-        while len(self._queue) > self._room:
-            self._queue.popleft()
-            self.skipped += 1
 
     def clear(self) -> None:
         """Drop everything: no station listens."""
-        self.skipped += len(self._queue)
         self._queue.clear()
         self._messages.clear()
         self._current = None
@@ -235,11 +229,6 @@ class Outbox:
     def add(self, store: ScanStore, now: float) -> None:
         """Offer a scan; it replaces a scan of the same id."""
         self._feeds[store.header.name] = _Feed(store, head_due=now)
-
-    @property
-    def skipped(self) -> int:
-        """Live items that were dropped; they remain in the store."""
-        return sum(lane.skipped for lane in self._live.values())
 
     # Events
 
