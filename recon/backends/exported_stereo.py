@@ -17,7 +17,16 @@ from torch import Tensor
 
 from recon.backends.padding import pyramid_levels
 from recon.stereo.belief_propagation import RADIUS, BeliefPropagationConfig
-from recon.stereo.matching_cost import CENSUS_OFFSETS, CENSUS_REACH, COST_UNIT
+from recon.stereo.matching_cost import (
+    BIT_COST,
+    CENSUS_OFFSETS,
+    CENSUS_REACH,
+    COST_UNIT,
+    LEVEL_COST,
+    MOST_BITS,
+    MOST_LEVELS,
+    UNSEEN_COST,
+)
 from recon.stereo.message_passing import FULL_WEIGHT
 
 FAR = 1.0e6  # more than any cost or sum of costs
@@ -61,7 +70,7 @@ def matching_cost(
     left: Tensor, right: Tensor, labels: int, config: BeliefPropagationConfig
 ) -> Tensor:
     """(L, h, w) cost of each label, see :mod:`recon.stereo.matching_cost`."""
-    c, width = config.cost, left.shape[1]
+    width = left.shape[1]
     bits_left, bits_right = census(left), census(right)
     layers = []
     for shift in range(config.min_disparity, config.min_disparity + labels):
@@ -72,14 +81,11 @@ def matching_cost(
         there = slice(first - shift, last - shift)
         bits = (bits_left[:, :, first:last] - bits_right[:, :, there]).abs().sum(0)
         gray = (left[:, first:last] - right[:, there]).abs()
-        seen = bits.clamp(max=c.census_truncation) * round(c.census_weight * COST_UNIT)
-        seen = seen + gray.clamp(max=c.difference_truncation) * round(
-            c.difference_weight * COST_UNIT
-        )
+        seen = bits.clamp(max=MOST_BITS) * BIT_COST + gray.clamp(max=MOST_LEVELS) * LEVEL_COST
         layers.append(F.pad(seen, (first, width - last), value=FAR))
     cost = torch.stack(layers)
     best = cost.amin(0, keepdim=True)
-    unseen = torch.where(best < FAR, best + round(c.unseen * COST_UNIT), torch.zeros_like(best))
+    unseen = torch.where(best < FAR, best + UNSEEN_COST, torch.zeros_like(best))
     return torch.where(cost < FAR, cost, unseen)
 
 

@@ -27,7 +27,15 @@ from recon.stereo.belief_propagation import (
     UNKNOWN,
     BeliefPropagationConfig,
 )
-from recon.stereo.matching_cost import CENSUS_OFFSETS, COST_UNIT
+from recon.stereo.matching_cost import (
+    BIT_COST,
+    CENSUS_OFFSETS,
+    COST_UNIT,
+    LEVEL_COST,
+    MOST_BITS,
+    MOST_LEVELS,
+    UNSEEN_COST,
+)
 from recon.stereo.message_passing import FULL_WEIGHT
 from recon.stereo.reprojection import (
     AGREE_SIGMAS,
@@ -76,16 +84,13 @@ def matching_cost(
     left: Tensor, right: Tensor, room: int, true: Tensor, config: BeliefPropagationConfig
 ) -> tuple[Tensor, Tensor]:
     """Cost of each label (h, w, L), and the same above the pixel's best and cut."""
-    c = config.cost
     h, w = left.shape
     words = torch.empty((2, h, w), dtype=torch.int32, device=left.device)
     census_kernel[(blocks(h * w, PIXELS), 2)](left, right, words, h, w, CENSUS_OFFSETS, PIXELS)
     cost, data = torch.empty((2, h, w, room), dtype=torch.int16, device=left.device)
     cost_kernel[(blocks(h * w, CELLS),)](
-        left, right, words, true, cost, data, h, w, config.min_disparity, c.census_truncation,
-        round(c.census_weight * COST_UNIT), c.difference_truncation,
-        round(c.difference_weight * COST_UNIT), round(c.unseen * COST_UNIT),
-        4 * config.truncation, room, CELLS,
+        left, right, words, true, cost, data, h, w, config.min_disparity, MOST_BITS,
+        BIT_COST, MOST_LEVELS, LEVEL_COST, UNSEEN_COST, 4 * config.truncation, room, CELLS,
     )  # fmt: skip
     return cost, data
 

@@ -13,7 +13,7 @@ parabola through the same costs and 0.3 px of one through the beliefs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -27,13 +27,7 @@ from recon.image_quality import local_variance
 from recon.parallel import parallel_for
 from recon.stereo.exposure import equalised
 from recon.stereo.lanes import LANES, PARTS, Lanes
-from recon.stereo.matching_cost import (
-    COST_UNIT,
-    MatchingCostConfig,
-    check_pair,
-    matching_cost,
-    plain,
-)
+from recon.stereo.matching_cost import COST_UNIT, check_pair, matching_cost, plain
 from recon.stereo.message_passing import (
     Smoothness,
     advance,
@@ -60,7 +54,6 @@ class BeliefPropagationConfig:
     edge_floor: float = 0.2  # share of the smoothness that is left across strong edges
     edge_contrast: int = 32  # gray levels between neighbours that make a strong edge
     min_disparity: int = 0  # px, disparity of label 0
-    cost: MatchingCostConfig = field(default_factory=MatchingCostConfig)
     min_evidence: float = 0.18  # how much better than the mean label, 0 to 1; 0: accept all
     min_contrast: float = 0.5  # gray levels of standard deviation in 9x9; 0: accept all
     occlusion_tolerance: float = 1.0  # labels; a surface seen behind another one; < 0: no check
@@ -95,7 +88,7 @@ def belief_propagation(
     check_pair(left, right, labels)
     right = equalised(left, right, labels, config.min_disparity)
     most = min(4 * config.truncation, 255)
-    above, least = matching_cost(left, right, labels, config.cost, config.min_disparity, most)
+    above, least = matching_cost(left, right, labels, config.min_disparity, most)
     weights = pyramid_of(config.smoothness.weights(plain(left)), config.levels)
     px, confidence = _labels(above, least, weights, config)
     return drop_unreliable(left, px, confidence, config)

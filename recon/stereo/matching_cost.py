@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -25,6 +24,10 @@ from recon.stereo.lanes import LANES, Lanes, cells_of
 from recon.types import I16, U8
 
 COST_UNIT = 100  # integer cost of a disparity step of one label between neighbours
+BIT_COST, MOST_BITS = 8, 16  # of each bit by which the census differs, and bits that count
+LEVEL_COST, MOST_LEVELS = 4, 20  # of each gray level of difference, and levels that count
+UNSEEN_COST = 100  # of a label whose partner is outside the image, above the best one
+"""One byte holds the cost of any label, and 255 is that of one that is not seen."""
 
 _NEAR = [(dv, du) for dv in range(-2, 3) for du in range(-2, 3) if dv or du]
 _FAR = [(-3, -1), (-3, 1), (-1, -3), (-1, 3), (1, -3), (1, 3), (3, -1), (3, 1)]
@@ -32,59 +35,19 @@ CENSUS_OFFSETS = tuple(_NEAR + _FAR)
 """Row and column of the neighbours that a pixel is compared with: 5x5, and eight on a ring around
 them, which tell weak texture from noise. They fill one 32-bit word."""
 
-MAX_COST = 254  # one byte holds it; 255 is that of a label that is not seen
 CENSUS_REACH = 3  # the farthest row or column of a neighbour
 BORDER = 4  # columns before the first one, an even number not below the reach
 MAX_SPARE = 8  # memory this many times larger than requested is released
 
 
-@dataclass(frozen=True, slots=True)
-class MatchingCostConfig:
-    """Weights of the data term, in units of one label of smoothness.
-
-    A census bit adds ``census_weight``, a gray level of difference ``difference_weight``;
-    each part stops growing at its truncation. Raises ValueError where they exceed MAX_COST.
-    """
-
-    census_weight: float = 0.08
-    census_truncation: int = 16  # bits
-    difference_weight: float = 0.04
-    difference_truncation: int = 20  # gray levels
-    unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
-
-    def __post_init__(self) -> None:
-        per_bit, max_bits, per_level, max_levels, unseen = self._rounded
-        most = max(per_bit * max_bits + per_level * max_levels, unseen)
-        if most > MAX_COST:
-            raise ValueError(f"costs of up to {most} are too large, at most {MAX_COST}")
-
-    @property
-    def integers(self) -> tuple[np.uint8, ...]:
-        """The fields in their order, in integer units; a byte holds what there is to truncate."""
-        return tuple(np.uint8(min(value, 255)) for value in self._rounded)
-
-    @property
-    def _rounded(self) -> tuple[int, ...]:
-        return (
-            round(self.census_weight * COST_UNIT), self.census_truncation,
-            round(self.difference_weight * COST_UNIT), self.difference_truncation,
-            round(self.unseen * COST_UNIT),
-        )  # fmt: skip
-
-
 def matching_cost(
-    left: U8,
-    right: U8,
-    labels: int,
-    config: MatchingCostConfig,
-    min_disparity: int = 0,
-    most: int = 255,
+    left: U8, right: U8, labels: int, min_disparity: int = 0, most: int = 255
 ) -> tuple[U8, U8]:
     """Cost of every label above the pixel's best one, (h, 2, labels, cells), and the best (h, 2,
     cells), in ``1 / COST_UNIT``; cells as in :mod:`recon.stereo.lanes`.
 
     Label ``l`` of left pixel (u, v) is compared with ``right[v, u - l - min_disparity]``. A
-    partner outside the right image is unseen: it costs ``config.unseen`` more than the
+    partner outside the right image is unseen: it costs ``UNSEEN_COST`` more than the
     pixel's best seen label, so that neighbours decide. Seen ones cost ``most`` more at most. The
     arrays are used again by the next call of the same thread. Raises ValueError for bad shapes.
     """
@@ -95,7 +58,7 @@ def matching_cost(
     least = WORKSPACE.take_bytes("least", (height, 2, cells))
     parallel_for(
         _cost_volume, height, columns_apart(left), columns_apart(right), width,
-        min_disparity, (*config.integers, np.uint8(most)), above, least, cells=above.size,
+        min_disparity, np.uint8(most), above, least, cells=above.size,
     )  # fmt: skip
     return above, least
 
@@ -189,26 +152,23 @@ def popcount(typingctx: Any, word: Any) -> Any:
 @intrinsic
 def _cost_block(
     typingctx: Any, left: Any, right: Any, stride: Any, partners: Any, labels: Any, step: Any,
-    weights: Any, above: Any, least: Any,
+    most: Any, above: Any, least: Any,
 ) -> Any:  # fmt: skip
     """Write LANES cells of all labels, less their least, and that.
 
     Addresses of: the cells in the left row (four parts of census, gray levels, what lies beyond),
     ``stride`` bytes apart, the same cells of the right row, the byte of each label's partner
     relative to those, int64, the costs of label 0, ``step`` bytes from label to label, and the
-    least costs. ``weights`` are the integers of the configuration and the most above the least.
+    least costs. ``most`` is the most above the least.
     """
     one = types.intp
-    parameters = types.UniTuple(types.uint8, 6)
-    return types.void(one, one, one, one, one, one, parameters, one, one), _cost_code
+    return types.void(one, one, one, one, one, one, types.uint8, one, one), _cost_code
 
 
 def _cost_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-    left, right, stride, partners, labels, step, weights, above, least = args
+    left, right, stride, partners, labels, step, most, above, least = args
     word, lanes = left.type, Lanes(builder, 8, LANES)
-    settings = [lanes.splat(w) for w in cgutils.unpack_tuple(builder, weights, 6)]
-    per_bit, max_bits, per_level, max_levels, unseen, most = settings
-    none, all_bits = lanes.constant(0), lanes.constant(255)
+    most, none, all_bits = lanes.splat(most), lanes.constant(0), lanes.constant(255)
 
     def row(start: Any) -> list[Any]:
         at = (builder.mul(stride, ir.Constant(word, k)) for k in range(6))
@@ -224,15 +184,17 @@ def _cost_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = builder.add(builder.add(*differ[:2]), builder.add(*differ[2:]))
         apart = builder.sub(lanes.most(gray, partner_gray), lanes.least(gray, partner_gray))
         value = builder.add(
-            builder.mul(lanes.least(bits, max_bits), per_bit),
-            builder.mul(lanes.least(apart, max_levels), per_level),
+            builder.mul(lanes.least(bits, lanes.constant(MOST_BITS)), lanes.constant(BIT_COST)),
+            builder.mul(
+                lanes.least(apart, lanes.constant(MOST_LEVELS)), lanes.constant(LEVEL_COST)
+            ),
         )
         value = builder.or_(value, outside)
         builder.store(lanes.least(builder.load(low), value), low)
         lanes.save(value, builder.add(above, builder.mul(loop.index, step)))
     best = builder.load(low)
     blind = builder.icmp_unsigned("==", best, all_bits)
-    rise = builder.select(blind, none, unseen)
+    rise = builder.select(blind, none, lanes.constant(UNSEEN_COST))
     exists = builder.not_(beyond)
     with cgutils.for_range(builder, labels) as loop:
         at = builder.add(above, builder.mul(loop.index, step))
@@ -246,7 +208,7 @@ def _cost_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _cost_volume(
-    begin: int, end: int, left: Any, right: Any, width: int, min_disparity: int, weights: Any,
+    begin: int, end: int, left: Any, right: Any, width: int, min_disparity: int, most: Any,
     above: Any, least: Any,
 ) -> None:  # fmt: skip
     _, _, labels, cells = above.shape
@@ -273,7 +235,7 @@ def _cost_volume(
                     partners.ctypes.data + parity * labels * 8,
                     labels,
                     cells,
-                    weights,
+                    most,
                     above.ctypes.data + (2 * v + parity) * labels * cells + first,
                     least.ctypes.data + (2 * v + parity) * cells + first,
                 )

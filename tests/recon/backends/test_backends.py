@@ -18,7 +18,7 @@ from recon import se3
 from recon.backends import BACKENDS, Backend, load_backend
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.matching_cost import MatchingCostConfig, matching_cost
+from recon.stereo.matching_cost import matching_cost
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap
 
@@ -75,7 +75,7 @@ def test_labels_minimise_the_reference_beliefs(
         }
     )  # fmt: skip
     left, right = pair(height, width, labels, config.min_disparity)
-    above, _ = matching_cost(left, right, labels, MatchingCostConfig(), config.min_disparity)
+    above, _ = matching_cost(left, right, labels, config.min_disparity)
     cost = np.empty((height, labels, width), np.int16)
     for parity in range(2):
         cost[:, :, parity::2] = above[:, parity, :, : (width + 1 - parity) // 2]

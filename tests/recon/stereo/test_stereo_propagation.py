@@ -15,9 +15,13 @@ from recon.stereo import message_passing
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.lanes import cells_of
 from recon.stereo.matching_cost import (
+    BIT_COST,
     CENSUS_OFFSETS,
     COST_UNIT,
-    MatchingCostConfig,
+    LEVEL_COST,
+    MOST_BITS,
+    MOST_LEVELS,
+    UNSEEN_COST,
     Workspace,
     census_row,
     columns_apart,
@@ -148,23 +152,17 @@ def test_census_against_its_definition() -> None:
         assert int(words[v, u]) == int("".join("1" if b else "0" for b in bits), 2)
 
 
-def test_costs_that_do_not_fit_a_byte_are_refused() -> None:
-    assert MatchingCostConfig(difference_truncation=31).difference_truncation == 31
-    with pytest.raises(ValueError, match="costs of up to 256 are too large, at most 254"):
-        MatchingCostConfig(difference_truncation=32)
-    with pytest.raises(ValueError, match="costs of up to 260 are too large"):
-        MatchingCostConfig(unseen=2.6)
-    assert MatchingCostConfig(difference_weight=0, difference_truncation=999).integers[3] == 255
+def test_a_byte_holds_the_cost_of_every_label_and_255_is_left() -> None:
+    most = BIT_COST * MOST_BITS + LEVEL_COST * MOST_LEVELS
+    assert max(most, UNSEEN_COST) < 255 and len(CENSUS_OFFSETS) >= MOST_BITS
 
 
 @pytest.mark.parametrize("min_disparity", [0, 3, -4, 40, -40])
 def test_matching_cost_against_its_definition(min_disparity: int) -> None:
     rng = np.random.default_rng(2)
     left, right = rng.integers(0, 256, (2, 9, 22), np.uint8)
-    config = MatchingCostConfig()
-    above, least = matching_cost(left, right, 6, config, min_disparity)
+    above, least = matching_cost(left, right, 6, min_disparity)
     words_left, words_right = census(left), census(right)
-    weights = [round(w * COST_UNIT) for w in (config.census_weight, config.difference_weight)]
     for v in range(9):
         for u in range(22):
             seen = {}
@@ -173,11 +171,9 @@ def test_matching_cost_against_its_definition(min_disparity: int) -> None:
                 if 0 <= x < 22:
                     bits = bin(int(words_left[v, u]) ^ int(words_right[v, x])).count("1")
                     gray_step = abs(int(left[v, u]) - int(right[v, x]))
-                    seen[label] = (
-                        min(bits, config.census_truncation) * weights[0]
-                        + min(gray_step, config.difference_truncation) * weights[1]
-                    )
-            unseen = min(seen.values()) + round(config.unseen * COST_UNIT) if seen else 0
+                    census_cost = min(bits, MOST_BITS) * BIT_COST
+                    seen[label] = census_cost + min(gray_step, MOST_LEVELS) * LEVEL_COST
+            unseen = min(seen.values()) + UNSEEN_COST if seen else 0
             want = [seen.get(label, unseen) for label in range(6)]
             cell = (u & 1, slice(None), u // 2)
             assert least[v, u & 1, u // 2] == min(want)
