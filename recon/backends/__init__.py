@@ -8,7 +8,6 @@ every backend against.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
@@ -17,13 +16,6 @@ from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPai
 if TYPE_CHECKING:
     from recon.mapping.registration import IcpConfig
     from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.stereo.upsampling import UpsamplingConfig
-
-
-@dataclass(frozen=True, slots=True)
-class DenseStages:
-    matching: BeliefPropagationConfig
-    upsampling: UpsamplingConfig
 
 
 class Backend(Protocol):
@@ -46,7 +38,7 @@ class Backend(Protocol):
         """Labels (real valued, 0 to labels - 1) of the left view, (h, w); Eq. 1."""
         ...
 
-    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+    def upsample(self, coarse: DisparityMap, guide: U8) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         ...
 
@@ -62,10 +54,10 @@ class Backend(Protocol):
         K: F64,
         size_px: tuple[int, int],
         T_world_camera: F64,
-        stages: DenseStages,
+        config: BeliefPropagationConfig,
     ) -> DepthMap | None:
         """Depth of a keyframe on its grid ``size_px`` (w, h), all stages on the device; None: do it
-        stage by stage. ``stages.matching.fill_occluded`` is not for it."""
+        stage by stage. ``config.fill_occluded`` is not for it."""
         ...
 
 

@@ -14,10 +14,8 @@ import numpy as np
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
-    from recon.backends import DenseStages
     from recon.mapping.registration import IcpConfig
     from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.stereo.upsampling import UpsamplingConfig
 
 
 class CpuBackend:
@@ -34,10 +32,10 @@ class CpuBackend:
 
         return belief_propagation(left, right, labels, config)
 
-    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+    def upsample(self, coarse: DisparityMap, guide: U8) -> DisparityMap:
         from recon.stereo.upsampling import upsample
 
-        return upsample(coarse, guide, config)
+        return upsample(coarse, guide)
 
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
@@ -52,7 +50,7 @@ class CpuBackend:
         K: F64,
         size_px: tuple[int, int],
         T_world_camera: F64,
-        stages: DenseStages,
+        config: BeliefPropagationConfig,
     ) -> None:
         """Nothing is gained here: None."""
 
@@ -61,7 +59,6 @@ def warm_up() -> None:
     """Compile every kernel, or load it from numba's cache on disk; seconds once, then less."""
     from recon.mapping.registration import IcpConfig
     from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.stereo.upsampling import UpsamplingConfig
 
     rng = np.random.default_rng(0)
     guide = rng.integers(0, 256, (180, 320, 3), np.uint8)  # rows enough for several threads
@@ -70,7 +67,7 @@ def warm_up() -> None:
     for fill in (False, True):
         matching = BeliefPropagationConfig(fill_occluded=fill)
         found = backend.belief_propagation(gray, gray, 4, matching)
-    backend.upsample(found, guide, UpsamplingConfig())
+    backend.upsample(found, guide)
     depth = DepthMap(
         np.full((64, 96), 50, np.float32),
         np.full((64, 96), 0.1, np.float32),

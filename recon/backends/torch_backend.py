@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recon.backends import DenseStages
 from recon.backends.padding import kept, padded, pyramid_levels
 from recon.backends.torch_depth import DensePath, upsampled
 from recon.backends.torch_plan import Plan, compiling, part, read
@@ -18,7 +16,7 @@ from recon.backends.triton_dense import contrast, stereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.exposure import equalised
 from recon.stereo.matching_cost import check_pair
-from recon.stereo.upsampling import UpsamplingConfig, check_guide
+from recon.stereo.upsampling import check_guide
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
@@ -66,13 +64,13 @@ class TorchBackend:
         px, confidence = px[:h, :w].copy(), confidence[:h, :w].copy()
         return drop_unreliable(left, px, confidence, config)
 
-    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+    def upsample(self, coarse: DisparityMap, guide: U8) -> DisparityMap:
         check_guide(coarse, guide)
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
         small, large = padded(h, w, 1)[:2], padded(H, W, 1)[:2]
         px, confidence = self._run(
-            ("upsample", *small, *large, config),
-            partial(upsampled, config=config),
+            ("upsample", *small, *large),
+            upsampled,
             (small, small, (*large, 3), (4,)),
             (coarse.px, coarse.confidence, guide, np.array([h, w, H, W])),
         )
@@ -93,10 +91,10 @@ class TorchBackend:
         K: F64,
         size_px: tuple[int, int],
         T_world_camera: F64,
-        stages: DenseStages,
+        config: BeliefPropagationConfig,
     ) -> DepthMap:
-        if self._path is None or self._path.stages != stages:
-            self._path = DensePath(self.device, stages)
+        if self._path is None or self._path.matching != config:
+            self._path = DensePath(self.device, config)
         return self._path.depth(pairs, K, size_px, T_world_camera)
 
     def _run(

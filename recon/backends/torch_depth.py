@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.backends import DenseStages
 from recon.backends.padding import kept, padded, pyramid_levels
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.triton_dense import (
@@ -28,6 +27,7 @@ from recon.backends.triton_dense import (
     reproject,
     stereo,
 )
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.exposure import equalised
 from recon.stereo.reprojection import (
     LABEL_SIGMA_PX,
@@ -37,7 +37,7 @@ from recon.stereo.reprojection import (
     PAIRS_CORRELATION,
 )
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
-from recon.stereo.upsampling import MIN_CONFIDENCE, UpsamplingConfig
+from recon.stereo.upsampling import MIN_CONFIDENCE
 from recon.types import F64, Array, DepthMap, StereoPair
 
 KEPT_PLANS = 8
@@ -46,8 +46,8 @@ KEPT_PLANS = 8
 class DensePath:
     """``device`` is that of the backend; one path serves one thread at a time."""
 
-    def __init__(self, device: str, stages: DenseStages) -> None:
-        self.device, self.stages = device, stages
+    def __init__(self, device: str, matching: BeliefPropagationConfig) -> None:
+        self.device, self.matching = device, matching
         self.plans: dict[Any, Plan] = {}
         self._fusions: dict[Any, tuple[Tensor, Plan]] = {}
 
@@ -65,7 +65,7 @@ class DensePath:
             )  # fmt: skip
             for slot, pair in enumerate(pairs):
                 plan = self._plan(pair, size_px)
-                plan.upload(device_inputs(pair, K, self.stages.matching.min_disparity), slot)
+                plan.upload(device_inputs(pair, K, self.matching.min_disparity), slot)
                 found[:, slot].copy_(torch.stack(plan.run()))
             depth, sigma, views = read(fusion.run())
         return DepthMap(depth, sigma, views, K, T_world_camera)
@@ -85,16 +85,16 @@ class DensePath:
         fine = None
         if pair.guide is not None:
             fine = padded(pair.guide.shape[0], pair.guide.shape[1], 1)[:2]
-        levels = pyramid_levels(h, w, self.stages.matching)
+        levels = pyramid_levels(h, w, self.matching)
         key = (space, fine, levels, size_px)
 
         def build() -> Plan:
             stage = partial(
                 pair_depth, labels=space[2], levels=levels, size_px=size_px,
-                stages=self.stages,
+                matching=self.matching,
             )  # fmt: skip
             shapes = [space[:2]] * 4 + [(*(fine or (0, 0)), 3), (5,), (15,)]
-            given = device_inputs(pair, np.eye(3), self.stages.matching.min_disparity)
+            given = device_inputs(pair, np.eye(3), self.matching.min_disparity)
             parts = [part(a, s) for a, s in zip(given, shapes, strict=True)]
             return Plan(self.device, stage, parts)
 
@@ -104,17 +104,17 @@ class DensePath:
 def pair_depth(
     left: Tensor, right: Tensor, left_seen: Tensor, right_seen: Tensor, guide: Tensor,
     true: Tensor, geometry: Tensor, *, labels: int, levels: int, size_px: tuple[int, int],
-    stages: DenseStages,
+    matching: BeliefPropagationConfig,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """One pair to depth and sigma (h, w) on the keyframe's grid, with room for ``labels``. ``true``
     (5,) is h, w of the pair, H, W of the guide and the number of labels."""
     own = torch.stack([true[0], true[1], true[4]])
-    px, confidence = stereo(left, right, labels, levels, own, stages.matching)
-    px, confidence = drop_unreliable(left, px, confidence, own, stages.matching)
+    px, confidence = stereo(left, right, labels, levels, own, matching)
+    px, confidence = drop_unreliable(left, px, confidence, own, matching)
     px, confidence = drop_unseen(px, confidence, left_seen, right_seen, own)
     sizes = true[:4]
     if guide.shape[0] > 0:
-        px, confidence = upsampled(px, confidence, guide, sizes, stages.upsampling)
+        px, confidence = upsampled(px, confidence, guide, sizes)
     else:
         sizes = torch.cat([true[:2], true[:2]])
     return reproject(px, confidence, geometry, sizes, size_px, MIN_REPROJECTED)
@@ -164,13 +164,11 @@ def device_inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:
     return [pair.left, right, *seen, guide, true, geometry]
 
 
-def upsampled(
-    px: Tensor, confidence: Tensor, guide: Tensor, true: Tensor, config: UpsamplingConfig
-) -> tuple[Tensor, Tensor]:
+def upsampled(px: Tensor, confidence: Tensor, guide: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
     """From (h, w) to the size of the guide (H, W, 3) in gray levels; Eq. 2. ``true`` (4,) is h, w,
     H, W."""
     taps = averaged(guide, (px.shape[0], px.shape[1]), true)
     trust = torch.where(px == px, confidence.clamp(min=MIN_CONFIDENCE), 0.0)
     value = torch.where(px == px, px, 0.0) * trust
     layers = torch.cat([taps.permute(2, 0, 1), torch.stack([trust, value])])
-    return bilateral(layers, guide, true, config)
+    return bilateral(layers, guide, true)

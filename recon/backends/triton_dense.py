@@ -43,7 +43,7 @@ from recon.stereo.reprojection import (
     MIN_SIGMA_SHARE,
     SINGLE_VIEW_SIGMA,
 )
-from recon.stereo.upsampling import RANGE_FLOOR, UpsamplingConfig
+from recon.stereo.upsampling import COLOUR_SCALE, DIAMETER, MIN_SUPPORT, RANGE_FLOOR, SPATIAL_SIGMA
 
 PIXELS = 128  # pixels of one program that holds one number each
 CELLS = 32  # pixels of one program that holds all labels of each
@@ -644,20 +644,17 @@ ROWS, COLUMNS = 4, 64  # fine pixels of one program
 LOG2_E = 1 / math.log(2)
 
 
-def bilateral(
-    layers: Tensor, guide: Tensor, true: Tensor, config: UpsamplingConfig
-) -> tuple[Tensor, Tensor]:
+def bilateral(layers: Tensor, guide: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
     """Labels and confidence (H, W) of a guide (H, W, 3); Eq. 2, all sums in registers. ``layers``
     (5, h, w) are what a tap brings: three colours, trust, trust times label."""
     _, h, w = layers.shape
     height, width, _ = guide.shape
-    tonal = math.sqrt(0.5 * LOG2_E) / config.range_sigma
-    spatial = math.sqrt(0.5 * LOG2_E) / config.spatial_sigma
-    layers[:3] *= tonal
+    spatial = math.sqrt(0.5 * LOG2_E) / SPATIAL_SIGMA
+    layers[:3] *= COLOUR_SCALE
     out, sure = torch.empty((2, height, width), device=guide.device)
     bilateral_kernel[(blocks(height, ROWS), blocks(width, COLUMNS))](
-        layers, guide.contiguous(), true, out, sure, height, width, h, w, tonal, spatial,
-        float(RANGE_FLOOR), config.min_support, config.diameter_px, ROWS, COLUMNS,
+        layers, guide.contiguous(), true, out, sure, height, width, h, w, COLOUR_SCALE, spatial,
+        RANGE_FLOOR, MIN_SUPPORT, DIAMETER, ROWS, COLUMNS,
     )  # fmt: skip
     return out, sure
 

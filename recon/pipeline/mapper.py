@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from recon.backends import Backend, DenseStages
+from recon.backends import Backend
 from recon.backends.cpu import CpuBackend
 from recon.calibration.adjusted_track import AdjustedTrack
 from recon.mapping.cloud_fusion import cloud_of, fuse
@@ -39,7 +39,6 @@ from recon.posegraph.pose_priors import check_prior
 from recon.posegraph.trajectory import Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.tracking.frame import CONTRADICTED, NO_IMAGE, Frame, Tracking
 from recon.tracking.odometry import Odometry
 from recon.types import U8, Array, Camera, DepthMap, Keyframe, PointCloud, Pose, PosePrior
@@ -188,13 +187,12 @@ class Mapper:
             guided=config.upsample, labels=config.labels,
         )  # fmt: skip
         matching = BeliefPropagationConfig(iterations=config.iterations)
-        dense = DenseStages(matching, UpsamplingConfig())
-        self.stereo = DenseStereo(backend, stereo, dense, self.rejected, self.debug, timing)
+        self.stereo = DenseStereo(backend, stereo, matching, self.rejected, self.debug, timing)
         self._first_stereo: DenseStereo | None = None
         if config.first_depths:
             first = replace(stereo, min_base_to_height=FIRST_BASE_TO_HEIGHT, guided=False,
                             width_px=stereo.width_px // COARSER)  # fmt: skip
-            self._first_stereo = DenseStereo(backend, first, dense, Counter(), None, untimed)
+            self._first_stereo = DenseStereo(backend, first, matching, Counter(), None, untimed)
         trajectory = Trajectory(PoseGraph(config.graph_keyframes))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, backend, self.rejected, timing)

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.backends import Backend, DenseStages
+from recon.backends import Backend
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.pipeline.views import StereoView
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
@@ -106,12 +107,12 @@ class DenseStereo:
         self,
         backend: Backend,
         config: VirtualStereoConfig,
-        dense: DenseStages,
+        matching: BeliefPropagationConfig,
         rejected: Counter[str],
         debug: dict[str, Array] | None,
         timing: Timing,
     ) -> None:
-        self._backend, self._config, self._dense = backend, config, dense
+        self._backend, self._config, self._matching = backend, config, matching
         self._rejected, self._debug, self._timing = rejected, debug, timing
         self._relief_m = (0.0, 0.0)
         self._noise = 1.0  # of labels, as the last view with several pairs showed
@@ -199,13 +200,13 @@ class DenseStereo:
         if not self._backend.keeps_pairs or len(plain) < len(pairs) or self._debug is not None:
             return None
         with self._timing("dense path"):
-            return self._backend.fused_depth(plain, K, size_px, T_odom_camera, self._dense)
+            return self._backend.fused_depth(plain, K, size_px, T_odom_camera, self._matching)
 
     def _matched(self, pair: RectifiedPair) -> DisparityMap:
         """Labels of the left view."""
         with self._timing("belief propagation"):
             coarse = self._backend.belief_propagation(
-                pair.left, pair.right, pair.labels, self._dense.matching
+                pair.left, pair.right, pair.labels, self._matching
             )
             coarse = drop_unseen(coarse, pair)
         self._show(rect_left=pair.left, rect_right=pair.right, disparity=coarse.px)
@@ -216,7 +217,7 @@ class DenseStereo:
         fine = coarse
         if pair.guide is not None:
             with self._timing("upsample"):
-                fine = self._backend.upsample(coarse, pair.guide, self._dense.upsampling)
+                fine = self._backend.upsample(coarse, pair.guide)
         self._show(upsampled=fine.px)
         return fine
 

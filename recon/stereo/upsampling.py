@@ -6,7 +6,6 @@ range kernel compares the guide at the fine pixel with the guide at the tap.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -18,7 +17,14 @@ from recon.parallel import parallel_for
 from recon.stereo.matching_cost import plain
 from recon.types import F32, I32, U8, DisparityMap
 
-PAPER_RATIO = 2704 / 320  # fine pixels per coarse pixel in the paper
+SPATIAL_SIGMA = 15.0 / (2704 / 320)  # coarse pixels
+RANGE_SIGMA = 15.0  # gray levels of the Euclidean distance of the colours
+DIAMETER = 10  # coarse pixels: the window is the nearest 10 x 10; a multiple of GROUP
+"""The paper's "filter 15, diameter 10", of its frame of 2704 px above views of 320, mapped so that
+any guide size gives one look."""
+
+MIN_SUPPORT = 0.5  # share of the weight that must fall on known taps
+COLOUR_SCALE = float(np.sqrt(0.5 * np.log2(np.e)) / RANGE_SIGMA)
 
 RANGE_FLOOR = -20.0
 """log2 of the least range weight, so that a pixel like none of its taps takes their mean."""
@@ -39,85 +45,60 @@ TAP_RUN = GROUP * CHANNELS * TILE
 while these lie in the nearest cache; values that a tap brings; floats of a run of taps."""
 
 
-@dataclass(frozen=True, slots=True)
-class UpsamplingConfig:
-    """The paper's "filter 15, diameter 10", mapped so that any guide size gives one look.
-
-    The spatial sigma is ``filter_px`` pixels of the paper's 2704 px frame, which are
-    15 / 8.45 = 1.78 coarse pixels; the range sigma is ``range_sigma`` gray levels of the
-    Euclidean distance of the colours; the window is the nearest ``diameter_px`` x
-    ``diameter_px`` coarse pixels.
-    """
-
-    filter_px: float = 15.0
-    range_sigma: float = 15.0  # gray levels
-    diameter_px: int = 10  # coarse pixels
-    min_support: float = 0.5  # share of the weight that must fall on known taps
-
-    @property
-    def spatial_sigma(self) -> float:
-        """Coarse pixels."""
-        return self.filter_px / PAPER_RATIO
-
-
-def upsample(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+def upsample(coarse: DisparityMap, guide: U8) -> DisparityMap:
     """``coarse`` (h, w) at the size of ``guide`` (H, W, 3) uint8; the values are not rescaled.
 
     Unknown taps carry no weight; a fine pixel is unknown (NaN) when less than
-    ``config.min_support`` of its weight falls on known ones. Raises ValueError for bad shapes.
+    ``MIN_SUPPORT`` of its weight falls on known ones. Raises ValueError for bad shapes.
     """
     check_guide(coarse, guide)
     shape = (guide.shape[0], guide.shape[1])
     h, w = coarse.px.shape
-    scale = float(np.sqrt(0.5 * np.log2(np.e)) / config.range_sigma)
-    base_y, spatial_y = window(h, shape[0], config)
-    base_x, spatial_x = window(w, shape[1], config)
+    base_y, spatial_y = window(h, shape[0])
+    base_x, spatial_x = window(w, shape[1])
     pad = -shape[1] % TILE
-    padded = -config.diameter_px % GROUP
     out, sure = np.empty((2, *shape), np.float32)
     parallel_for(
         _bilateral,
         -(-shape[1] // TILE),
-        _taps(coarse, guide, scale),
+        _taps(coarse, guide),
         plain(guide),
         np.pad(base_x, (0, pad), mode="edge"),
         base_y,
-        np.pad(spatial_x, ((0, pad), (0, padded)), constant_values=OUTSIDE),
+        np.pad(spatial_x, ((0, pad), (0, 0)), constant_values=OUTSIDE),
         np.ascontiguousarray(spatial_y.T),
-        scale,
-        float(config.min_support),
         out,
         sure,
     )
     return DisparityMap(out, sure)
 
 
-def window(taps: int, fine: int, config: UpsamplingConfig) -> tuple[I32, F32]:
+def window(taps: int, fine: int) -> tuple[I32, F32]:
     """First tap of each fine pixel along one axis (fine,) and log2 of s (fine, diameter)."""
     q = (np.arange(fine) + 0.5) * (taps / fine) - 0.5
-    first = np.ceil(q - config.diameter_px / 2).astype(np.int32)
-    distance = first[:, None] + np.arange(config.diameter_px) - q[:, None]
-    spatial = -0.5 * np.log2(np.e) * (distance / config.spatial_sigma) ** 2
+    first = np.ceil(q - DIAMETER / 2).astype(np.int32)
+    distance = first[:, None] + np.arange(DIAMETER) - q[:, None]
+    spatial = -0.5 * np.log2(np.e) * (distance / SPATIAL_SIGMA) ** 2
     return first, np.maximum(spatial, FARTHEST).astype(np.float32)
 
 
-def _taps(coarse: DisparityMap, guide: U8, scale: float) -> F32:
+def _taps(coarse: DisparityMap, guide: U8) -> F32:
     """Colour (3), confidence * disparity, confidence and known, as (h, 6, w) float32."""
     h, w = coarse.px.shape
     taps = np.empty((h, CHANNELS, w), np.float32)
     colour = guide_at_taps(guide, (h, w))
-    _fill_taps(plain(coarse.px), plain(coarse.confidence), colour, scale, taps)
+    _fill_taps(plain(coarse.px), plain(coarse.confidence), colour, taps)
     return taps
 
 
 @njit(cache=True, nogil=True)
-def _fill_taps(px: Any, confidence: Any, colour: Any, scale: float, taps: Any) -> None:
+def _fill_taps(px: Any, confidence: Any, colour: Any, taps: Any) -> None:
     for v in range(px.shape[0]):
         for u in range(px.shape[1]):
             known = not np.isnan(px[v, u])
             c = max(confidence[v, u], np.float32(MIN_CONFIDENCE)) if known else np.float32(0)
             for channel in range(3):
-                taps[v, channel, u] = np.float32(scale) * np.float32(colour[v, u, channel])
+                taps[v, channel, u] = np.float32(COLOUR_SCALE) * np.float32(colour[v, u, channel])
             taps[v, 3, u] = c * px[v, u] if known else np.float32(0)
             taps[v, 4, u] = c
             taps[v, 5, u] = np.float32(known)
@@ -232,19 +213,19 @@ def _columns(base: Any, spatial: Any, first: int, width: int, index: Any, near: 
 
 
 @njit(cache=True, nogil=True)
-def _load_colour(guide: Any, scale: Any, colour: Any) -> None:
+def _load_colour(guide: Any, colour: Any) -> None:
     """The scaled colours of a run of fine pixels: (channel, pixel), flat."""
     for x in range(guide.shape[0]):
         for channel in range(3):
-            colour[channel * TILE + x] = scale * np.float32(guide[x, channel])
+            colour[channel * TILE + x] = np.float32(COLOUR_SCALE) * np.float32(guide[x, channel])
 
 
 @njit(cache=True, nogil=True)
-def _finish(sums: Any, support: Any, out: Any, sure: Any) -> None:
+def _finish(sums: Any, out: Any, sure: Any) -> None:
     """Eq. 2's division by K_p for one run of fine pixels."""
     for x in range(out.shape[0]):
         everything, weight = sums[x], sums[2 * TILE + x]
-        good = sums[TILE + x] > support * everything
+        good = sums[TILE + x] > np.float32(MIN_SUPPORT) * everything
         out[x] = sums[3 * TILE + x] / weight if good else np.float32(np.nan)
         sure[x] = weight / everything if good else np.float32(0)
 
@@ -259,8 +240,6 @@ def _bilateral(
     base_y: Any,
     spatial_x: Any,
     spatial_y: Any,
-    colour_scale: float,
-    min_support: float,
     out: Any,
     sure: Any,
 ) -> None:
@@ -287,7 +266,7 @@ def _bilateral(
                 rows += 1
             for y in range(rows):
                 sums[y, :] = np.float32(0)
-                _load_colour(guide[top + y, first:last], np.float32(colour_scale), colour[y])
+                _load_colour(guide[top + y, first:last], colour[y])
             for k in range(reach):
                 j = base_y[top] + k
                 if 0 <= j < h:
@@ -299,5 +278,5 @@ def _bilateral(
                         _add_taps(tap, near[group], spatial_y[k, top : top + rows], colour, sums)
             for y in range(rows):
                 v = top + y
-                _finish(sums[y], np.float32(min_support), out[v, first:last], sure[v, first:last])
+                _finish(sums[y], out[v, first:last], sure[v, first:last])
             top += rows

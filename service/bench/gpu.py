@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from recon.backends import Backend, DenseStages, load_backend
+from recon.backends import Backend, load_backend
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import DepthMap, StereoPair
 from service.bench import BenchOptions, BenchResult, compare
 from service.bench.stereo import scene
@@ -37,7 +36,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
 def calls(backend: Backend, compiled: Backend, options: BenchOptions) -> list[BenchResult]:
     """The backend's three calls, images up and results down, compared with the compiled ones."""
     left, right = scene(*SIZE, LABELS)
-    matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
+    matching = BeliefPropagationConfig()
     coarse = compiled.belief_propagation(left, right, LABELS, matching)
     guide = np.random.default_rng(0).integers(0, 256, (GUIDE[1], GUIDE[0], 3), np.uint8)
     source, target = ground(0.3), ground(0.0)
@@ -48,7 +47,7 @@ def calls(backend: Backend, compiled: Backend, options: BenchOptions) -> list[Be
         f"stereo {size}, {LABELS} labels":
             lambda b: b.belief_propagation(left, right, LABELS, matching),
         f"upsampling {size} to {GUIDE[0]}x{GUIDE[1]}, exact":
-            lambda b: b.upsample(coarse, guide, upsampling),
+            lambda b: b.upsample(coarse, guide),
         f"ICP of {SIZE[0] * SIZE[1]} points, 6 iterations":
             lambda b: b.register(source, target, np.eye(4), icp),
     }  # fmt: skip
@@ -63,13 +62,12 @@ def calls(backend: Backend, compiled: Backend, options: BenchOptions) -> list[Be
 
 def clouds(backend: Backend, options: BenchOptions) -> list[BenchResult]:
     """The fused depth of some pairs, without leaving the device in between."""
-    stages = DenseStages(BeliefPropagationConfig(), UpsamplingConfig())
-    pair, K = flown_pair(DEPTH), camera(DEPTH)
+    pair, K, matching = flown_pair(DEPTH), camera(DEPTH), BeliefPropagationConfig()
     size = f"{DEPTH[0]}x{DEPTH[1]} from pairs of {SIZE[0]}x{SIZE[1]}"
     return [
         compare(
             f"cloud of {size}, {count} pair(s), with uploads",
-            partial(backend.fused_depth, [pair] * count, K, DEPTH, np.eye(4), stages),
+            partial(backend.fused_depth, [pair] * count, K, DEPTH, np.eye(4), matching),
             options, note=f"{backend.name} on {backend.device}",
         )
         for count in PAIRS

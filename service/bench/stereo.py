@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import U8, DisparityMap
 from service.bench import BenchOptions, BenchResult, compare
 from service.compute.backend_choice import choose_backend
@@ -72,7 +71,7 @@ def run_upsampling(options: BenchOptions) -> list[BenchResult]:
     for height, width in GUIDES:
         guide = rng.integers(0, 256, (height, width, 3), np.uint8)
         what = f"{COARSE[1]}x{COARSE[0]} to {width}x{height}, exact"
-        ours = partial(backend.upsample, coarse, guide, UpsamplingConfig())
+        ours = partial(backend.upsample, coarse, guide)
         theirs = partial(cv2.bilateralFilter, guide, 10, 15, 15)
         peer = "OpenCV bilateralFilter d 10"
         results.append(compare(what, ours, options, peer, theirs, backend.name))

@@ -94,19 +94,18 @@ def pointless(name: str, is_there: Callable[[str], object] = find_spec) -> str |
 def trial(backend: Backend) -> float:
     """Minimum seconds from an image pair to upsampled disparity, after a warm-up round."""
     from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.stereo.upsampling import UpsamplingConfig
 
     rng = np.random.default_rng(0)
     height, width = TRIAL_SIZE
     guide = rng.integers(0, 256, (2 * height, 2 * width, 3), np.uint8)
     left = np.ascontiguousarray(guide[:height, :width, 0])
     right = np.roll(left, -5, axis=1)
-    matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
+    matching = BeliefPropagationConfig()
     best = float("inf")
     for _ in range(TRIAL_ROUNDS + 1):
         start = time.perf_counter()
         coarse = backend.belief_propagation(left, right, TRIAL_LABELS, matching)
-        backend.upsample(coarse, guide, upsampling)
+        backend.upsample(coarse, guide)
         best = min(best, time.perf_counter() - start)
     return best
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from recon.backends import DenseStages
 from recon.backends.padding import pyramid_levels
 from recon.backends.torch_depth import DensePath, upsampled
 from recon.backends.torch_icp import DeviceIcp
@@ -27,7 +25,7 @@ from recon.backends.triton_dense import drop_unreliable, drop_unseen, fuse, repr
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE
-from recon.stereo.upsampling import UpsamplingConfig
+from recon.stereo.upsampling import DIAMETER
 from recon.types import Array, StereoPair
 from service.bench import BenchOptions, BenchResult, compare
 from service.bench.gpu import DEPTH, GUIDE, LABELS, SIZE, camera, flown_pair, ground
@@ -217,7 +215,6 @@ def icp_stage(device: str, config: IcpConfig) -> Stage:
 def dense_stages(device: str, pair: StereoPair, matching: BeliefPropagationConfig) -> list[Stage]:
     """From two rectified images to fused depth, one after the other."""
     w, h = SIZE
-    upsampling = UpsamplingConfig()
     assert pair.guide is not None and pair.left_seen is not None
     H, W = pair.guide.shape[:2]
     own, both = np.array([h, w, LABELS]), np.array([h, w, H, W])
@@ -237,7 +234,7 @@ def dense_stages(device: str, pair: StereoPair, matching: BeliefPropagationConfi
         pair.left, px, sure, seen, seen, own,
     )  # fmt: skip
     px, sure = (t.cpu().numpy() for t in trusted.run())
-    finer = planned(device, partial(upsampled, config=upsampling), px, sure, pair.guide, both)
+    finer = planned(device, upsampled, px, sure, pair.guide, both)
     fine = [t.cpu().numpy() for t in finer.run()]
     to_left = pair.K @ np.linalg.inv(camera((W, H)))
     base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX]
@@ -254,7 +251,7 @@ def dense_stages(device: str, pair: StereoPair, matching: BeliefPropagationConfi
         device, lambda a, b: fuse(a, b), np.stack([z] * PAIRS),
         np.stack([sigma] * PAIRS),
     )  # fmt: skip
-    taps, pixels = upsampling.diameter_px**2, w * h
+    taps, pixels = DIAMETER**2, w * h
     return [
         staged(f"stereo {w}x{h}, {LABELS} labels, on the device", device, labels, moved,
                operations),
@@ -272,15 +269,14 @@ def dense_stages(device: str, pair: StereoPair, matching: BeliefPropagationConfi
 def whole_path(device: str, pair: StereoPair, matching: BeliefPropagationConfig) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then images up and depth down, and four."""
     assert pair.guide is not None
-    stages = DenseStages(matching, UpsamplingConfig())
-    path = DensePath(device, stages)
+    path = DensePath(device, matching)
     H, W = pair.guide.shape[:2]
     K = camera((W, H))
     path.depth([pair], K, (W, H), np.eye(4))
     plan = next(iter(path.plans.values()))
-    moved, operations = propagation_work(stages.matching, 2)
+    moved, operations = propagation_work(matching, 2)
     moved += (11.0 + 12.0) * W * H
-    operations += 20.0 * stages.upsampling.diameter_px**2 * W * H
+    operations += 20.0 * DIAMETER**2 * W * H
     what = f"cloud of {W}x{H} from pairs of {SIZE[0]}x{SIZE[1]}"
 
     def cloud(count: int) -> Callable[[], object]:

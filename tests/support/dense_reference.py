@@ -9,7 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.stereo.message_passing import FULL_WEIGHT, Smoothness
-from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig, guide_at_taps
+from recon.stereo.upsampling import (
+    DIAMETER,
+    MIN_CONFIDENCE,
+    MIN_SUPPORT,
+    RANGE_FLOOR,
+    RANGE_SIGMA,
+    SPATIAL_SIGMA,
+    guide_at_taps,
+)
 from recon.types import F64, I64, U8, DisparityMap
 
 
@@ -80,37 +88,37 @@ def _pool_weights(weights: I64) -> I64:
     return np.stack([above, left])
 
 
-def upsample(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
+def upsample(coarse: DisparityMap, guide: U8) -> DisparityMap:
     """Joint bilateral upsampling (Eq. 2), one tap of the window at a time."""
     (h, w), (height, width) = coarse.px.shape, guide.shape[:2]
-    first_y, log_y = _axis(h, height, config)
-    first_x, log_x = _axis(w, width, config)
+    first_y, log_y = _axis(h, height)
+    first_x, log_x = _axis(w, width)
     known = np.isfinite(coarse.px)
     trust = np.where(known, np.maximum(coarse.confidence, MIN_CONFIDENCE), 0)
     colour = guide_at_taps(guide, (h, w)).astype(np.float64)
     sums = np.zeros((4, height, width))
-    for j in range(config.diameter_px):
-        for i in range(config.diameter_px):
+    for j in range(DIAMETER):
+        for i in range(DIAMETER):
             y, x = np.ix_(np.clip(first_y + j, 0, h - 1), np.clip(first_x + i, 0, w - 1))
             inside = np.logical_and.outer(first_y + j == y[:, 0], first_x + i == x[0])
             distance = ((guide - colour[y, x]) ** 2).sum(axis=2)
             near = np.exp(log_y[:, j, None] + log_x[None, :, i])
-            alike = np.exp(-distance / (2 * config.range_sigma**2))
+            alike = np.exp(-distance / (2 * RANGE_SIGMA**2))
             weight = inside * near * np.maximum(alike, 2.0**RANGE_FLOOR)
             c = weight * trust[y, x]
             sums += np.stack(
                 [weight, weight * known[y, x], c, c * np.where(known, coarse.px, 0)[y, x]]
             )
-    good = sums[1] > config.min_support * sums[0]
+    good = sums[1] > MIN_SUPPORT * sums[0]
     with np.errstate(invalid="ignore"):
         px = np.where(good, sums[3] / sums[2], np.nan)
     sure = np.where(good, sums[2] / sums[0], 0)
     return DisparityMap(px.astype(np.float32), sure.astype(np.float32))
 
 
-def _axis(taps: int, fine: int, config: UpsamplingConfig) -> tuple[I64, F64]:
+def _axis(taps: int, fine: int) -> tuple[I64, F64]:
     """First tap of each fine pixel along an axis and the log of s at each of its taps."""
     q = (np.arange(fine) + 0.5) * taps / fine - 0.5
-    first = np.ceil(q - config.diameter_px / 2).astype(np.int64)
-    distance = first[:, None] + np.arange(config.diameter_px) - q[:, None]
-    return first, -0.5 * (distance / config.spatial_sigma) ** 2
+    first = np.ceil(q - DIAMETER / 2).astype(np.int64)
+    distance = first[:, None] + np.arange(DIAMETER) - q[:, None]
+    return first, -0.5 * (distance / SPATIAL_SIGMA) ** 2

@@ -19,7 +19,6 @@ from recon.backends import BACKENDS, Backend, load_backend
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.matching_cost import matching_cost
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap
 
 ACCEPT_ALL = BeliefPropagationConfig(
@@ -135,7 +134,7 @@ def test_pairs_of_nearly_one_size_share_what_is_built(backend: Backend) -> None:
         guide = rng.integers(0, 256, (round(1.5 * height), round(1.5 * width), 3), np.uint8)
         found = backend.belief_propagation(image, image, labels, ACCEPT_ALL)
         assert found.px.shape == (height, width)
-        assert backend.upsample(found, guide, UpsamplingConfig()).px.shape == guide.shape[:2]
+        assert backend.upsample(found, guide).px.shape == guide.shape[:2]
     assert len(built) <= 3  # the guide of the widest has a larger array
 
 
@@ -160,15 +159,14 @@ def test_upsampling_equals_the_reference(
     patches = rng.integers(0, 256, (5, 7, 3), np.uint8)
     guide = np.asarray(cv2.resize(patches, (fine[1], fine[0])), np.uint8)
     given = DisparityMap(px, confidence)
-    for config in (UpsamplingConfig(), UpsamplingConfig(diameter_px=3, range_sigma=30)):
-        got, want = backend.upsample(given, guide, config), reference.upsample(given, guide, config)
-        assert got.px.shape == fine
-        assert (np.isnan(got.px) != np.isnan(want.px)).mean() < 2e-3
-        both = np.isfinite(got.px) & np.isfinite(want.px)
-        off = np.abs(got.px - want.px)[both]
-        share, trust = (0.97, 5e-3) if backend.name == "torch" else (1.0, 1e-3)
-        assert (off < 0.01).mean() >= share and off.max() < (0.2 if share < 1 else 0.01)
-        np.testing.assert_allclose(got.confidence[both], want.confidence[both], atol=trust)
+    got, want = backend.upsample(given, guide), reference.upsample(given, guide)
+    assert got.px.shape == fine
+    assert (np.isnan(got.px) != np.isnan(want.px)).mean() < 2e-3
+    both = np.isfinite(got.px) & np.isfinite(want.px)
+    off = np.abs(got.px - want.px)[both]
+    share, trust = (0.97, 5e-3) if backend.name == "torch" else (1.0, 1e-3)
+    assert (off < 0.01).mean() >= share and off.max() < (0.2 if share < 1 else 0.01)
+    np.testing.assert_allclose(got.confidence[both], want.confidence[both], atol=trust)
 
 
 def hills(T_world_camera: F64, seed: int) -> DepthMap:
@@ -214,7 +212,7 @@ def test_bad_input_is_named(backend: Backend) -> None:
         backend.belief_propagation(image, image[:, :-1], 16, ACCEPT_ALL)
     given = DisparityMap(np.zeros((20, 30), np.float32), np.ones((20, 30), np.float32))
     with pytest.raises(ValueError, match="smaller"):
-        backend.upsample(given, np.zeros((10, 10, 3), np.uint8), UpsamplingConfig())
+        backend.upsample(given, np.zeros((10, 10, 3), np.uint8))
 
 
 def test_unknown_backend_is_named() -> None:

@@ -17,14 +17,13 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.backends import DenseStages
 from recon.stereo import belief_propagation as compiled
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import MIN_CONFIDENCE, PairDepth
 from recon.stereo.reprojection import fuse as compiled_fuse
 from recon.stereo.reprojection import label_noise as compiled_noise
 from recon.stereo.reprojection import reproject as compiled_reproject
-from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps
+from recon.stereo.upsampling import guide_at_taps
 from recon.stereo.upsampling import upsample as compiled_upsample
 from recon.stereo.virtual_stereo import drop_unseen as compiled_drop
 from recon.types import F32, U8, Array, DepthMap, DisparityMap, StereoPair
@@ -241,7 +240,7 @@ def by_stages(pairs: list[StereoPair], matching: BeliefPropagationConfig) -> Dep
         found = compiled.belief_propagation(pair.left, pair.right, pair.labels, matching)
         found = compiled_drop(found, pair)
         if pair.guide is not None:
-            found = compiled_upsample(found, pair.guide, UpsamplingConfig())
+            found = compiled_upsample(found, pair.guide)
         depths.append(compiled_reproject(found, pair, K, SIZE))
     return compiled_fuse(depths, K, np.eye(4), compiled_noise(depths) or 1.0)
 
@@ -260,7 +259,7 @@ def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
     from recon.backends.torch_depth import DensePath
 
     matching = BeliefPropagationConfig() if device == "cuda" else QUICK
-    path = DensePath(device, DenseStages(matching, UpsamplingConfig()))
+    path = DensePath(device, matching)
     pairs = pairs_for(device, guide)
     for chosen in (pairs, pairs[:1], pairs[::-1]) if device == "cuda" else (pairs,):
         want = by_stages(chosen, matching)
@@ -275,7 +274,7 @@ def test_the_path_needs_a_pair(device: str) -> None:
     from recon.backends.torch_depth import DensePath
 
     with pytest.raises(ValueError, match="no stereo pair"):
-        path = DensePath(device, DenseStages(BeliefPropagationConfig(), UpsamplingConfig()))
+        path = DensePath(device, BeliefPropagationConfig())
         path.depth([], K, SIZE, np.eye(4))
 
 
@@ -284,20 +283,19 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     from recon.backends.torch_backend import TorchBackend
     from service.compute.backend_choice import FallbackBackend
 
-    stages = DenseStages(QUICK, UpsamplingConfig())
     pair = pairs_for(device, 0)[0]
     own = TorchBackend(device)
     backend = FallbackBackend(own)
     assert backend.keeps_pairs
-    found = backend.fused_depth([pair], K, SIZE, np.eye(4), stages)
+    found = backend.fused_depth([pair], K, SIZE, np.eye(4), QUICK)
     assert found is not None
-    close(found.depth_m, by_stages([pair], stages.matching).depth_m, 1e-3, 0.99, SMALL)
+    close(found.depth_m, by_stages([pair], QUICK).depth_m, 1e-3, 0.99, SMALL)
 
     def lost(*given: object) -> None:
         raise RuntimeError("CUDA error: device lost")
 
     own.fused_depth = lost  # type: ignore[assignment, method-assign]
-    assert backend.fused_depth([pair], K, SIZE, np.eye(4), stages) is None
+    assert backend.fused_depth([pair], K, SIZE, np.eye(4), QUICK) is None
     assert backend.failure == "CUDA error: device lost"
     assert backend.name == "cpu"
     assert not backend.keeps_pairs

@@ -14,10 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.backends import DenseStages
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import U8, DepthMap, StereoPair
 
 torch = pytest.importorskip("torch")
@@ -117,13 +115,10 @@ def test_a_keyframe_from_images_to_fused_depth(device: str, reads: list[int]) ->
         R_left_keyframe=np.eye(3), guide=np.repeat(left[:, :, None], 3, 2), left_seen=seen,
         right_seen=seen,
     )  # fmt: skip
-    stages = DenseStages(
-        BeliefPropagationConfig(iterations=1, levels=1, speckle_px=4),
-        UpsamplingConfig(diameter_px=3),
-    )  # fmt: skip
+    config = BeliefPropagationConfig(iterations=1, levels=1, speckle_px=4)
     backend = TorchBackend(device)
     reads.clear()
-    path = lambda: backend.fused_depth([pair] * 2, K, (96, 54), np.eye(4), stages)  # noqa: E731
+    path = lambda: backend.fused_depth([pair] * 2, K, (96, 54), np.eye(4), config)  # noqa: E731
     assert watched(device, path) == []
     assert reads == [(4 + 4 + 1) * 96 * 54] * 2  # bytes
 

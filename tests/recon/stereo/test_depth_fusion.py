@@ -11,7 +11,6 @@ from painted_ground import SIZE, on_plane, pose, still
 from painted_ground import K as K_IMAGE
 from some_views import view_at
 
-from recon.backends import DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.pipeline.stages import DenseStereo, untimed
 from recon.stereo.belief_propagation import BeliefPropagationConfig
@@ -23,7 +22,6 @@ from recon.stereo.reprojection import (
     fuse,
     label_noise,
 )
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F32
 
 K = np.array([[100.0, 0, 39.5], [0, 100.0, 29.5], [0, 0, 1]])
@@ -168,9 +166,9 @@ def test_sigma_holds_however_much_the_images_are_compressed(quality: int, most: 
     T = images[0].T_odom_camera
     ground = on_plane(K_IMAGE, SIZE, T)[::997]
     view = view_at(0, T, image=images[0], partners=images[1:], points=ground)
-    dense = DenseStages(BeliefPropagationConfig(), UpsamplingConfig())
+    matching = BeliefPropagationConfig()
     config = VirtualStereoConfig(width_px=240, guided=False)
-    depth, _ = DenseStereo(CpuBackend(), config, dense, Counter(), None, untimed)(view)
+    depth, _ = DenseStereo(CpuBackend(), config, matching, Counter(), None, untimed)(view)
     assert depth is not None
     truth = on_plane(depth.K, (240, 180), T)[:, 2].reshape(180, 240)
     known = np.isfinite(depth.depth_m)

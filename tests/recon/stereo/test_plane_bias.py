@@ -12,7 +12,7 @@ from recon.camera_model import scaled_K
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
-from recon.stereo.upsampling import UpsamplingConfig, upsample
+from recon.stereo.upsampling import upsample
 from recon.stereo.virtual_stereo import drop_unseen, rectify
 from recon.types import F64, StereoPair
 
@@ -37,7 +37,7 @@ def heights(width_px: int, upsampled: bool, east_m: float, min_known: float = 0.
     labels = belief_propagation(pair.left, pair.right, pair.labels, BeliefPropagationConfig())
     labels = drop_unseen(labels, pair)
     if pair.guide is not None:
-        labels = upsample(labels, pair.guide, UpsamplingConfig())
+        labels = upsample(labels, pair.guide)
     depth = reproject(labels, pair, K_grid, (w, h)).depth_m
     truth = on_plane(K_grid, (w, h), left.T_odom_camera)[:, 2].reshape(h, w)
     off = HEIGHT_M * (1.0 - depth / truth)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -11,9 +10,9 @@ import pytest
 from some_views import view_at
 
 from recon import se3
-from recon.backends import DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.pipeline.stages import DenseStereo, untimed
+from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reproject
 from recon.types import F64, DisparityMap, StereoPair
@@ -147,8 +146,9 @@ def test_a_pair_is_matched_once_on_a_backend_that_gives_its_depth() -> None:
         own = CpuBackend()
         own.name, own.keeps_pairs = "onnx", keeps_pairs
         stage = DenseStereo(
-            FallbackBackend(own), VirtualStereoConfig(), Mock(DenseStages), Counter(), None, untimed
-        )
+            FallbackBackend(own), VirtualStereoConfig(), BeliefPropagationConfig(), Counter(), None,
+            untimed,
+        )  # fmt: skip
         stage.keep(0, {1: PairDepth(depth, 0.01 * depth)})
         assert [*stage.carried(again, K, (320, 180))] == found
 

@@ -342,7 +342,7 @@ def test_read_only_and_strided_images_compile_nothing_new() -> None:
 
     def once(image: U8, guide: U8, config: BeliefPropagationConfig) -> DisparityMap:
         found = belief_propagation(image, image, 4, config)
-        return upsampling.upsample(found, guide, upsampling.UpsamplingConfig())
+        return upsampling.upsample(found, guide)
 
     want = once(image, guide, BeliefPropagationConfig())
     before = [len(kernel.signatures) for kernel in kernels]

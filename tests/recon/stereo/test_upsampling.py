@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import dense_reference as reference
 import numpy as np
 import pytest
 
-from recon.stereo.upsampling import UpsamplingConfig, upsample
+from recon.stereo.upsampling import DIAMETER, RANGE_SIGMA, SPATIAL_SIGMA, upsample
 from recon.types import U8, DisparityMap
-
-CONFIG = UpsamplingConfig()
 
 
 def scene(
@@ -41,7 +37,7 @@ def scene(
 def test_equals_the_reference(coarse: tuple[int, int], fine: tuple[int, int], holes: float) -> None:
     """Every tap in double precision: within 0.01 px of 16, and the same pixels known."""
     given, guide = scene(coarse, fine, holes)
-    got, want = upsample(given, guide, CONFIG), reference.upsample(given, guide, CONFIG)
+    got, want = upsample(given, guide), reference.upsample(given, guide)
     assert got.px.shape == fine
     assert (np.isnan(got.px) != np.isnan(want.px)).mean() < 1e-3
     both = np.isfinite(got.px) & np.isfinite(want.px)
@@ -49,22 +45,10 @@ def test_equals_the_reference(coarse: tuple[int, int], fine: tuple[int, int], ho
     np.testing.assert_allclose(got.confidence[both], want.confidence[both], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("diameter", "filter_px"), [(2, 8), (3, 8), (5, 30), (10, 8), (10, 1), (11, 4), (24, 100)]
-)
-def test_other_windows_equal_the_reference(diameter: int, filter_px: float) -> None:
-    given, guide = scene((12, 17), (50, 70), 0.1)
-    config = replace(CONFIG, diameter_px=diameter, range_sigma=40.0, filter_px=filter_px)
-    got, want = upsample(given, guide, config), reference.upsample(given, guide, config)
-    both = np.isfinite(got.px) & np.isfinite(want.px)
-    assert both.mean() > 0.8
-    np.testing.assert_allclose(got.px[both], want.px[both], atol=0.01)
-
-
-def test_defaults_are_the_papers() -> None:
+def test_the_window_is_the_papers() -> None:
     """Filter 15 at 2704 px is 1.775 coarse pixels of 320; diameter 10 is ten taps a side."""
-    assert (CONFIG.filter_px, CONFIG.range_sigma, CONFIG.diameter_px) == (15, 15, 10)
-    assert CONFIG.spatial_sigma == pytest.approx(15 * 320 / 2704)
+    assert (RANGE_SIGMA, DIAMETER) == (15, 10)
+    assert pytest.approx(15 * 320 / 2704) == SPATIAL_SIGMA
 
 
 def test_eq_2_for_one_pixel_by_hand() -> None:
@@ -72,21 +56,20 @@ def test_eq_2_for_one_pixel_by_hand() -> None:
     px = np.arange(12 * 12, dtype=np.float32).reshape(12, 12)
     given = DisparityMap(px, np.ones((12, 12), np.float32))
     guide = np.full((48, 48, 3), 77, np.uint8)
-    config = replace(CONFIG, diameter_px=2)
     x, y = 21, 26
     qx, qy = (x + 0.5) / 4 - 0.5, (y + 0.5) / 4 - 0.5
     total = weight = 0.0
-    for j in (6, 7) if qy > 6 else (5, 6):
-        for i in (4, 5):
-            s = np.exp(-((i - qx) ** 2 + (j - qy) ** 2) / (2 * config.spatial_sigma**2))
+    for j in range(2, 12):  # the nearest ten to 6.125
+        for i in range(10):  # and to 4.875
+            s = np.exp(-((i - qx) ** 2 + (j - qy) ** 2) / (2 * SPATIAL_SIGMA**2))
             total, weight = total + s * px[j, i], weight + s
-    assert upsample(given, guide, config).px[y, x] == pytest.approx(total / weight, abs=0.02)
+    assert upsample(given, guide).px[y, x] == pytest.approx(total / weight, abs=0.02)
 
 
 def test_a_constant_stays_and_values_are_not_rescaled() -> None:
     given = DisparityMap(np.full((18, 32), 7.25, np.float32), np.ones((18, 32), np.float32))
     _, guide = scene((18, 32), (72, 128))
-    found = upsample(given, guide, CONFIG)
+    found = upsample(given, guide)
     np.testing.assert_allclose(found.px, 7.25, atol=2e-3)
     np.testing.assert_allclose(found.confidence, 1, atol=2e-3)
 
@@ -101,7 +84,7 @@ def test_depth_edge_follows_the_colour_edge() -> None:
     truth = np.where(near, 12.0, 5.0)
     stairs = cv2.resize(truth, (32, 18), interpolation=cv2.INTER_NEAREST).astype(np.float32)
     given = DisparityMap(stairs, np.ones((18, 32), np.float32))
-    error = np.abs(upsample(given, guide, CONFIG).px - truth)
+    error = np.abs(upsample(given, guide).px - truth)
     linear = np.abs(cv2.resize(stairs, (256, 144)) - truth)
     assert (error > 1).mean() < 0.01 < 0.02 < (linear > 1).mean()
 
@@ -111,13 +94,13 @@ def test_holes_stay_holes_and_do_not_leak() -> None:
     px[4:14, 8:24] = np.nan
     confidence = np.isfinite(px).astype(np.float32)
     guide = np.full((72, 128, 3), 120, np.uint8)
-    found = upsample(DisparityMap(px, confidence), guide, CONFIG)
+    found = upsample(DisparityMap(px, confidence), guide)
     assert np.isnan(found.px[28:44, 48:80]).all()
     assert np.isfinite(found.px[:8]).all()
     np.testing.assert_allclose(found.px[np.isfinite(found.px)], 4, atol=2e-3)
     assert (found.confidence[np.isnan(found.px)] == 0).all()
     unknown = DisparityMap(np.full((5, 6), np.nan, np.float32), np.zeros((5, 6), np.float32))
-    assert np.isnan(upsample(unknown, guide, CONFIG).px).all()
+    assert np.isnan(upsample(unknown, guide).px).all()
 
 
 def test_an_unsure_tap_counts_less() -> None:
@@ -125,14 +108,14 @@ def test_an_unsure_tap_counts_less() -> None:
     confidence = np.ones((18, 32), np.float32)
     px[9, 16], confidence[9, 16] = 16.0, 0.01
     guide = np.full((72, 128, 3), 120, np.uint8)
-    doubtful = upsample(DisparityMap(px, confidence), guide, CONFIG).px
-    certain = upsample(DisparityMap(px, np.ones_like(px)), guide, CONFIG).px
+    doubtful = upsample(DisparityMap(px, confidence), guide).px
+    certain = upsample(DisparityMap(px, np.ones_like(px)), guide).px
     assert doubtful[38, 66] < 4.02 < 4.3 < certain[38, 66]
 
 
 def test_bad_input_is_named() -> None:
     given, guide = scene((18, 32), (72, 128))
     with pytest.raises(ValueError, match="smaller"):
-        upsample(given, guide[:10], CONFIG)
+        upsample(given, guide[:10])
     with pytest.raises(ValueError, match="guide must be"):
-        upsample(given, guide[:, :, 0], CONFIG)
+        upsample(given, guide[:, :, 0])
