@@ -149,7 +149,7 @@ class VoxelMap:
         out = np.zeros(depth.depth_m.shape, np.bool_)
         parallel_for(
             _fresh, len(out), self._keys, self._ids, self._voxels, *_arrays(depth),
-            1.0 / self.voxel_m, BETTER_RATIO, REACH_SIGMA, LARGEST_REACH, out,
+            1.0 / self.voxel_m, out,
         )  # fmt: skip
         return out
 
@@ -256,7 +256,7 @@ def _put(keys: I64, ids: I32, held: Rows, count: int, new: Rows) -> int:
 @njit(cache=True, nogil=True, fastmath=False)
 def _fresh(
     begin: int, end: int, keys: I64, ids: I32, held: Rows, depth: F32, sigma: F32, K: F64, T: F64,
-    inverse: float, better: float, reach_sigma: float, largest_reach: int, out: Bool,
+    inverse: float, out: Bool,
 ) -> None:  # fmt: skip
     """See VoxelMap.fresh; the ray is sampled every voxel, nearest samples first."""
     w = depth.shape[1]
@@ -273,8 +273,7 @@ def _fresh(
             dz = T[2, 0] * a + T[2, 1] * b + T[2, 2]
             step = 1.0 / (inverse * np.sqrt(dx * dx + dy * dy + dz * dz))
             # Held surface may be as uncertain as this one: sqrt(2) of its sigma.
-            reach = min(int(np.ceil(reach_sigma * 1.4142 * s / step)), largest_reach)
-            reach = max(reach, min(1, largest_reach))
+            reach = max(min(int(np.ceil(REACH_SIGMA * 1.4142 * s / step)), LARGEST_REACH), 1)
             known = False
             for n in range(2 * reach + 1):
                 offset = (n + 1) // 2 if n % 2 else -(n // 2)
@@ -284,7 +283,7 @@ def _fresh(
                     known = True
                     break
                 t = find_slot(keys, key)
-                if keys[t] == key and held[ids[t]].sigma_m <= s * better:
+                if keys[t] == key and held[ids[t]].sigma_m <= s * BETTER_RATIO:
                     known = True
                     break
             out[v, u] = not known
