@@ -23,8 +23,8 @@ from recon.stereo.matching_cost import (
     CENSUS_REACH,
     COST_UNIT,
     LEVEL_COST,
-    MOST_BITS,
-    MOST_LEVELS,
+    MAX_BITS,
+    MAX_LEVELS,
     UNSEEN_COST,
 )
 from recon.stereo.message_passing import FULL_WEIGHT
@@ -81,7 +81,7 @@ def matching_cost(
         there = slice(first - shift, last - shift)
         bits = (bits_left[:, :, first:last] - bits_right[:, :, there]).abs().sum(0)
         gray = (left[:, first:last] - right[:, there]).abs()
-        seen = bits.clamp(max=MOST_BITS) * BIT_COST + gray.clamp(max=MOST_LEVELS) * LEVEL_COST
+        seen = bits.clamp(max=MAX_BITS) * BIT_COST + gray.clamp(max=MAX_LEVELS) * LEVEL_COST
         layers.append(F.pad(seen, (first, width - last), value=FAR))
     cost = torch.stack(layers)
     best = cost.amin(0, keepdim=True)

@@ -32,8 +32,8 @@ from recon.stereo.matching_cost import (
     CENSUS_OFFSETS,
     COST_UNIT,
     LEVEL_COST,
-    MOST_BITS,
-    MOST_LEVELS,
+    MAX_BITS,
+    MAX_LEVELS,
     UNSEEN_COST,
 )
 from recon.stereo.message_passing import FULL_WEIGHT
@@ -89,8 +89,8 @@ def matching_cost(
     census_kernel[(blocks(h * w, PIXELS), 2)](left, right, words, h, w, CENSUS_OFFSETS, PIXELS)
     cost, data = torch.empty((2, h, w, room), dtype=torch.int16, device=left.device)
     cost_kernel[(blocks(h * w, CELLS),)](
-        left, right, words, true, cost, data, h, w, config.min_disparity, MOST_BITS,
-        BIT_COST, MOST_LEVELS, LEVEL_COST, UNSEEN_COST, 4 * config.truncation, room, CELLS,
+        left, right, words, true, cost, data, h, w, config.min_disparity, MAX_BITS,
+        BIT_COST, MAX_LEVELS, LEVEL_COST, UNSEEN_COST, 4 * config.truncation, room, CELLS,
     )  # fmt: skip
     return cost, data
 

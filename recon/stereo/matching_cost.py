@@ -24,8 +24,8 @@ from recon.stereo.lanes import LANES, Lanes, cells_of
 from recon.types import I16, U8
 
 COST_UNIT = 100  # integer cost of a disparity step of one label between neighbours
-BIT_COST, MOST_BITS = 8, 16  # of each bit by which the census differs, and bits that count
-LEVEL_COST, MOST_LEVELS = 4, 20  # of each gray level of difference, and levels that count
+BIT_COST, MAX_BITS = 8, 16  # of each bit by which the census differs, and bits that count
+LEVEL_COST, MAX_LEVELS = 4, 20  # of each gray level of difference, and levels that count
 UNSEEN_COST = 100  # of a label whose partner is outside the image, above the best one
 """One byte holds the cost of any label, and 255 is that of one that is not seen."""
 
@@ -184,10 +184,8 @@ def _cost_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = builder.add(builder.add(*differ[:2]), builder.add(*differ[2:]))
         apart = builder.sub(lanes.most(gray, partner_gray), lanes.least(gray, partner_gray))
         value = builder.add(
-            builder.mul(lanes.least(bits, lanes.constant(MOST_BITS)), lanes.constant(BIT_COST)),
-            builder.mul(
-                lanes.least(apart, lanes.constant(MOST_LEVELS)), lanes.constant(LEVEL_COST)
-            ),
+            builder.mul(lanes.least(bits, lanes.constant(MAX_BITS)), lanes.constant(BIT_COST)),
+            builder.mul(lanes.least(apart, lanes.constant(MAX_LEVELS)), lanes.constant(LEVEL_COST)),
         )
         value = builder.or_(value, outside)
         builder.store(lanes.least(builder.load(low), value), low)

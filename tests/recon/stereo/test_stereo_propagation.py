@@ -19,8 +19,8 @@ from recon.stereo.matching_cost import (
     CENSUS_OFFSETS,
     COST_UNIT,
     LEVEL_COST,
-    MOST_BITS,
-    MOST_LEVELS,
+    MAX_BITS,
+    MAX_LEVELS,
     UNSEEN_COST,
     Workspace,
     census_row,
@@ -153,8 +153,8 @@ def test_census_against_its_definition() -> None:
 
 
 def test_a_byte_holds_the_cost_of_every_label_and_255_is_left() -> None:
-    most = BIT_COST * MOST_BITS + LEVEL_COST * MOST_LEVELS
-    assert max(most, UNSEEN_COST) < 255 and len(CENSUS_OFFSETS) >= MOST_BITS
+    most = BIT_COST * MAX_BITS + LEVEL_COST * MAX_LEVELS
+    assert max(most, UNSEEN_COST) < 255 and len(CENSUS_OFFSETS) >= MAX_BITS
 
 
 @pytest.mark.parametrize("min_disparity", [0, 3, -4, 40, -40])
@@ -171,8 +171,8 @@ def test_matching_cost_against_its_definition(min_disparity: int) -> None:
                 if 0 <= x < 22:
                     bits = bin(int(words_left[v, u]) ^ int(words_right[v, x])).count("1")
                     gray_step = abs(int(left[v, u]) - int(right[v, x]))
-                    census_cost = min(bits, MOST_BITS) * BIT_COST
-                    seen[label] = census_cost + min(gray_step, MOST_LEVELS) * LEVEL_COST
+                    census_cost = min(bits, MAX_BITS) * BIT_COST
+                    seen[label] = census_cost + min(gray_step, MAX_LEVELS) * LEVEL_COST
             unseen = min(seen.values()) + UNSEEN_COST if seen else 0
             want = [seen.get(label, unseen) for label in range(6)]
             cell = (u & 1, slice(None), u // 2)
