@@ -54,8 +54,9 @@ class FramePoses:
             self._settled += 1
 
     def finish(self) -> None:
-        """Place frames by the whole graph from now on."""
-        self._newest = None
+        """Place frames by the whole graph from now on, all of them anew in the order of time."""
+        self._newest = self._seen = None
+        self._fallbacks.clear()
 
     def place(self, frame: Frame) -> Pose | None:
         """A new frame in the world, by vision or else by telemetry; None where neither tells."""

@@ -14,13 +14,11 @@ from typing import Any, TextIO
 import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
-from recon import se3
-from recon.pipeline.frame_poses import pose_at
 from recon.pipeline.mapper import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.ground import GUESSED_SHARE
 from recon.poses import sigma_m
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
-from recon.types import F64, Keyframe, Pose
+from recon.types import F64, Keyframe, Pose, PosePrior
 from service.cameras.rig import Rig, attitude_of
 from service.errors import OutsideError
 from service.flight.pipeline import Pipeline
@@ -29,12 +27,8 @@ from service.scans.drawing import save_debug
 from service.scans.track import cell, seconds_text
 from service.scans.trust import FIRST_TELEMETRY
 from service.stream.codec import IMAGE_SHARE, encode, encode_image
-from service.stream.records import PoseRecord, Repose
+from service.stream.records import PoseRecord, Repose, pack_pose
 from service.stream.store import ScanStore
-
-REPUBLISH_M, REPUBLISH_RAD, REPUBLISH_SHARE = 0.05, 0.001, 0.1
-"""A frame's pose is written again if by the end it moved or turned by more than this (5 cm of the
-ground from 50 m), or its sigma changed by more than this share."""
 
 BATCH, REPLAYED = 256, 16
 """Poses in one transaction, which takes a synchronised write of the disk: those written again in
@@ -46,32 +40,38 @@ FRAME = np.dtype(
         ("time_ns", np.int64),  # unix
         ("seq", np.int64),
         ("segment", np.int32),
-        ("T_odom_camera", np.float64, (4, 4)),
-        ("T_world_camera", np.float64, (4, 4)),  # as written, as all below
-        ("sigma_m", np.float64),
-        ("agl_m", np.float64),  # NaN: unknown
+        ("T_odom_camera", np.float64, (4, 4)),  # NaN: lost
+        ("R_world_camera", np.float64, (3, 3)),  # by telemetry, as all of the next four
+        ("sigma_turn_rad", np.float64, 2),  # tilt, yaw
+        ("position_m", np.float64, 3),
+        ("sigma_position_m", np.float64, 3),
+        ("agl_m", np.float64),
         ("is_view", np.bool_),
+        ("crc", np.uint32),  # the record's own, as it was written
     ]
 )
-"""A row of the file: one frame."""
+"""A row of the file: one frame. Numbers that are not known are NaN."""
 
 
 class PublishedFrames:
-    """Published poses of the frames that refer to a keyframe, in order; on the disk but for the
-    newest. The file has no name and is gone with the process."""
+    """Frames whose poses were published, in order: each with what places it again in the end. On
+    the disk but for the newest. The file has no name and is gone with the process."""
 
     def __init__(self, folder: Path) -> None:
         self._fresh: deque[tuple[Frame, Any]] = deque()
         self._file = tempfile.TemporaryFile(dir=folder, buffering=1 << 16)  # noqa: SIM115
 
     def add(self, frame: Frame, row: Any, is_settled: Callable[[Frame], bool]) -> None:
-        """Take the next frame's row of :data:`FRAME` but for what the ``frame`` knows; those whose
-        keyframes no longer change go to the disk.
+        """Take the next frame's row of :data:`FRAME` but for what the ``frame`` knows, instead of
+        the last one's where that is the same frame, lost until now; rows whose keyframes no longer
+        change go to the disk.
 
         Raises OutsideError when the disk takes no more.
         """
+        if self._fresh and self._fresh[-1][0].seq == frame.seq:
+            self._fresh.pop()
         self._fresh.append((frame, row))
-        while self._fresh and is_settled(self._fresh[0][0]):
+        while len(self._fresh) > 1 and is_settled(self._fresh[0][0]):
             try:
                 self._file.write(_whole(*self._fresh.popleft()).tobytes())
             except OSError as error:
@@ -89,8 +89,32 @@ class PublishedFrames:
 
 
 def _whole(frame: Frame, row: Any) -> Any:
-    row["seq"], row["segment"], row["T_odom_camera"] = frame.seq, frame.segment, frame.T_odom_camera
+    prior = frame.prior
+    row["seq"], row["segment"] = frame.seq, frame.segment
+    row["T_odom_camera"] = frame.T_odom_camera if frame.is_placed else np.nan
+    row["sigma_turn_rad"] = prior.sigma_tilt_rad, prior.sigma_yaw_rad
+    for name in ("R_world_camera", "position_m", "sigma_position_m"):
+        value = getattr(prior, name)
+        row[name] = np.nan if value is None else value
     return row
+
+
+def _crc(record: PoseRecord) -> int:
+    return int.from_bytes(pack_pose(record)[-4:], "little")
+
+
+def _frame(row: Any) -> Frame:
+    """The frame of a row, with all that places it."""
+    T, R, position, sigma = (
+        None if np.isnan(row[name]).any() else row[name]
+        for name in ("T_odom_camera", "R_world_camera", "position_m", "sigma_position_m")
+    )
+    prior = PosePrior(R, *row["sigma_turn_rad"].tolist(), position, sigma)
+    state = Tracking.LOST if T is None else Tracking.TRACKED
+    return Frame(
+        NO_IMAGE, int(row["time_ns"]), int(row["seq"]), prior, state=state,
+        segment=int(row["segment"]), T_keyframe_camera=T,
+    )  # fmt: skip
 
 
 class Recorder:
@@ -144,13 +168,12 @@ class Recorder:
         if pose is None:
             return
         time_ns = frame.time_ns + self._offset_ns
-        if frame.is_placed:
-            row = np.zeros((), FRAME)
-            row["time_ns"], row["is_view"], row["sigma_m"] = time_ns, posed.is_view, sigma_m(pose)
-            row["agl_m"] = np.nan if agl_m is None else agl_m
-            row["T_world_camera"] = pose.T_world_camera
-            self._frames.add(frame, row, self.mapper.is_settled)
         self.last = self._record(time_ns, pose, agl_m, frame.seq if posed.is_view else None)
+        row = np.zeros((), FRAME)
+        row["time_ns"], row["is_view"] = time_ns, posed.is_view
+        row["agl_m"] = np.nan if agl_m is None else agl_m
+        row["crc"] = _crc(self.last)
+        self._frames.add(frame, row, self.mapper.is_settled)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
             self._write_due()
@@ -179,31 +202,26 @@ class Recorder:
             self.store.add_poses(due)
 
     def _correct_trajectory(self) -> None:
-        """Write those poses again that corrections have moved; the newest of a time holds."""
+        """Write every pose again that differs from the published one, by however little: that one
+        hangs on how many keyframes were done when its frame came, and what a scan holds must not
+        depend on how fast the computer was. The newest of a time holds."""
         self._write_due()
         self._last, self.distance_m = None, 0.0
-        moved = self._moved()
-        while batch := list(islice(moved, BATCH)):
+        changed = self._changed()
+        while batch := list(islice(changed, BATCH)):
             self.store.add_poses(batch)
 
-    def _moved(self) -> Iterator[PoseRecord]:
-        """The poses that corrections have moved, or whose sigma they have changed."""
+    def _changed(self) -> Iterator[PoseRecord]:
         for row in self._frames.rows():
-            T, before_m, agl_m = row["T_world_camera"], float(row["sigma_m"]), float(row["agl_m"])
-            time_ns, seq = int(row["time_ns"]), int(row["seq"])
-            frame = Frame(
-                NO_IMAGE, time_ns, seq, segment=int(row["segment"]),
-                T_keyframe_camera=row["T_odom_camera"],
-            )  # fmt: skip
-            published = pose_at(T, T[:3, 3], np.full(3, before_m / 3**0.5))
+            frame, agl_m = _frame(row), float(row["agl_m"])
+            pose = self.mapper.frame_poses.place(frame)
+            if pose is None:
+                continue
             record = self._record(
-                time_ns, self.mapper.frame_poses.pose(frame, published),
-                None if math.isnan(agl_m) else agl_m, seq if row["is_view"] else None,
+                frame.time_ns, pose, None if math.isnan(agl_m) else agl_m,
+                frame.seq if row["is_view"] else None,
             )  # fmt: skip
-            moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - T[:3, 3])
-            turned_rad = np.linalg.norm(se3.so3_log(T[:3, :3].T @ record.T_world_camera[:3, :3]))
-            resized = abs(record.sigma_m - before_m) > REPUBLISH_SHARE * record.sigma_m
-            if moved_m > REPUBLISH_M or turned_rad > REPUBLISH_RAD or resized:
+            if _crc(record) != row["crc"]:
                 yield record
 
     def summary(self) -> dict[str, Any]:

@@ -189,11 +189,11 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     in_flight = placed(frames, prior, frame)
     keyframes.trajectory.moved(final=True)
     frames.finish()
-    again = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))
+    again = placed(frames, prior, frame)
     for pose in (in_flight, again):
         np.testing.assert_allclose(pose.T_world_camera[:3, 3], fix)
         assert sigma_m(pose) == pytest.approx(5.0 * 3**0.5)
     known = Alignment(1.0, np.eye(3), np.zeros(3), np.eye(7))
     keyframes.graph.segments[0].similarity = known
-    carried = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))
+    carried = placed(frames, prior, frame)
     assert np.linalg.norm(carried.T_world_camera[:3, 3] - fix) > 1.0

@@ -13,7 +13,7 @@ from some_views import keyframe_at
 
 from recon import se3
 from recon.tracking.frame import NO_IMAGE, Frame
-from recon.types import F64
+from recon.types import F64, PosePrior
 from service.errors import OutsideError
 from service.flight.recorder import FRAME, PublishedFrames
 
@@ -35,9 +35,10 @@ def before(limit: int) -> Any:
 
 def published(seq: int, key: Any, agl_m: float = 41.5) -> tuple[Frame, Any]:
     row = np.zeros((), FRAME)
-    row["time_ns"], row["T_world_camera"] = 10**18 + seq, some_pose()
-    row["sigma_m"], row["agl_m"], row["is_view"] = 0.5 + seq, agl_m, seq % 2 == 0
-    frame = Frame(NO_IMAGE, 0, seq, segment=key.segment, reference=key)
+    row["time_ns"], row["crc"] = 10**18 + seq, 2**32 - 1 - seq
+    row["agl_m"], row["is_view"] = agl_m, seq % 2 == 0
+    prior = PosePrior(None if seq % 3 else np.eye(3), 0.01, 0.5, RNG.normal(size=3))
+    frame = Frame(NO_IMAGE, 0, seq, prior, segment=key.segment, reference=key)
     frame.T_keyframe_camera = some_pose()
     return frame, row
 
@@ -52,9 +53,13 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
     found = list(kept.rows())
     assert not list(tmp_path.iterdir())  # no name: nothing is left behind
     for (frame, one), other in zip(frames, found, strict=True):
-        for name in ("time_ns", "is_view", "sigma_m", "T_world_camera"):
+        for name in ("time_ns", "is_view", "crc"):
             assert np.array_equal(one[name], other[name])
         assert np.array_equal(one["agl_m"], other["agl_m"], equal_nan=True)
+        assert np.array_equal(frame.prior.position_m, other["position_m"])
+        assert np.isnan(other["sigma_position_m"]).all()
+        assert (frame.prior.R_world_camera is None) == np.isnan(other["R_world_camera"]).all()
+        assert other["sigma_turn_rad"].tolist() == [0.01, 0.5]
         assert np.array_equal(frame.T_odom_camera, other["T_odom_camera"])
         assert (frame.seq, frame.segment) == (other["seq"], other["segment"])
     kept.close()
