@@ -16,16 +16,6 @@ from recon.tracking.frame import Frame, Tracking
 from recon.types import F64, Pose, PosePrior
 
 
-def pose_at(
-    T_odom_camera: F64, place_m: F64, sigma_m: F64, sources: tuple[str, ...] = ("vision",)
-) -> Pose:
-    """A frame at a place (3,) with sigma (3,), turned as the odometry has it, as long as no
-    keyframe carries it."""
-    T = se3.compose(T_odom_camera[:3, :3], place_m)
-    covariance = se3.about(-place_m, np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
-    return Pose(T, covariance, sources, is_aligned=False)
-
-
 class FramePoses:
     """Places frames by the pose of the newest view, so that they never wait for the graph; by the
     graph itself after :meth:`finish`."""
@@ -62,13 +52,14 @@ class FramePoses:
         """A new frame in the world, by vision or else by telemetry; None where neither tells."""
         if not frame.is_placed:
             return self._by_telemetry(frame.prior) if frame.state is Tracking.LOST else None
-        pose = self.pose(frame, self._fallback(frame))
+        pose = self._by_vision(frame, self._fallback(frame))
         self._seen = frame.prior, pose
         return pose
 
     def _fallback(self, frame: Frame) -> Pose:
-        """A frame at its fix, or as far from the last one as the odometry has it. Heading and scale
-        of the odometry are not known: the sigma grows by the way."""
+        """A frame that no keyframe carries: turned as the odometry has it, at its fix, or as far
+        from the last one as the odometry has it. Heading and scale of the odometry are not known:
+        the sigma grows by the way."""
         at_m, prior = frame.T_odom_camera[:3, 3], frame.prior
         fix, sigma = prior.position_m, prior.sigma_position_m
         if fix is not None and sigma is not None:
@@ -77,18 +68,19 @@ class FramePoses:
         from_m, place_m, sigma_m, sources = self._fallbacks.setdefault(frame.segment, start)
         way_m = at_m - from_m
         sigma_m = np.hypot(sigma_m, np.linalg.norm(way_m))
-        return pose_at(frame.T_odom_camera, place_m + way_m, sigma_m, sources)
+        T = se3.compose(frame.T_odom_camera[:3, :3], place_m + way_m)
+        covariance = se3.about(-T[:3, 3], np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
+        return Pose(T, covariance, sources, is_aligned=False)
 
-    def pose(self, frame: Frame, fallback: Pose) -> Pose:
-        """A frame in the world, carried by the view at or before it where it can. A segment too
-        short to be aligned has no scale and no heading: its frames stay at their fixes."""
+    def _by_vision(self, frame: Frame, fallback: Pose) -> Pose:
+        """A frame carried by the view at or before it where it can. A segment too short to be
+        aligned has no scale and no heading: its frames stay at their fixes."""
         view = self._view_of(frame)
         if view is None:
             return fallback
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self._map.trajectory.pose(view.seq)
-        at_fix = self._fallbacks.get(frame.segment)
-        if at_fix is not None and "gnss" in at_fix[3] and not known.is_aligned:
+        if "gnss" in self._fallbacks[frame.segment][3] and not known.is_aligned:
             return fallback
         pose = carried(known, se3.inverse(view.T_odom_camera) @ frame.T_odom_camera)
         after = self._map.graph.refuted.get(view.seq) if self._newest is None else None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+import os
+import pickle
 import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
@@ -18,7 +20,7 @@ from recon.pipeline.mapper import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.ground import GUESSED_SHARE
 from recon.poses import sigma_m
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
-from recon.types import F64, Keyframe, Pose, PosePrior
+from recon.types import F64, Keyframe, Pose
 from service.cameras.rig import Rig, attitude_of
 from service.errors import OutsideError
 from service.flight.pipeline import Pipeline
@@ -35,86 +37,60 @@ BATCH, REPLAYED = 256, 16
 the end, and those of a recording, which can be replayed."""
 
 
-FRAME = np.dtype(
-    [
-        ("time_ns", np.int64),  # unix
-        ("seq", np.int64),
-        ("segment", np.int32),
-        ("T_odom_camera", np.float64, (4, 4)),  # NaN: lost
-        ("R_world_camera", np.float64, (3, 3)),  # by telemetry, as all of the next four
-        ("sigma_turn_rad", np.float64, 2),  # tilt, yaw
-        ("position_m", np.float64, 3),
-        ("sigma_position_m", np.float64, 3),
-        ("agl_m", np.float64),
-        ("is_view", np.bool_),
-        ("crc", np.uint32),  # the record's own, as it was written
-    ]
-)
-"""A row of the file: one frame. Numbers that are not known are NaN."""
-
-
 class PublishedFrames:
-    """Frames whose poses were published, in order: each with what places it again in the end. On
-    the disk but for the newest. The file has no name and is gone with the process."""
+    """Frames whose poses were published, in order, each with what places it again in the end and
+    what was written of it. On the disk but for the newest. The file has no name and is gone with
+    the process."""
 
     def __init__(self, folder: Path) -> None:
         self._fresh: deque[tuple[Frame, Any]] = deque()
         self._file = tempfile.TemporaryFile(dir=folder, buffering=1 << 16)  # noqa: SIM115
 
-    def add(self, frame: Frame, row: Any, is_settled: Callable[[Frame], bool]) -> None:
-        """Take the next frame's row of :data:`FRAME` but for what the ``frame`` knows, instead of
-        the last one's where that is the same frame, lost until now; rows whose keyframes no longer
-        change go to the disk.
+    def add(self, frame: Frame, written: Any, is_settled: Callable[[Frame], bool]) -> None:
+        """Take the next frame, instead of the last one where that is the same, lost until now;
+        those whose keyframes no longer change go to the disk.
 
         Raises OutsideError when the disk takes no more.
         """
         if self._fresh and self._fresh[-1][0].seq == frame.seq:
             self._fresh.pop()
-        self._fresh.append((frame, row))
+        self._fresh.append((frame, written))
         while len(self._fresh) > 1 and is_settled(self._fresh[0][0]):
             try:
-                self._file.write(_whole(*self._fresh.popleft()).tobytes())
+                settled, own = self._fresh.popleft()
+                pickle.dump((_known(settled), own), self._file)
             except OSError as error:
                 why = f"poses cannot be stored for the scan: {error.strerror}"
                 raise OutsideError(why) from error
 
-    def rows(self) -> Iterator[Any]:
+    def all(self) -> Iterator[tuple[Frame, Any]]:
+        """Each frame with what was ``written``."""
+        end = self._file.seek(0, os.SEEK_END)
         self._file.seek(0)
-        while row := self._file.read(FRAME.itemsize):
-            yield np.frombuffer(row, FRAME)[0]
-        yield from (_whole(*one) for one in self._fresh)
+        while self._file.tell() < end:
+            known, written = pickle.load(self._file)
+            yield Frame(NO_IMAGE, **known), written
+        yield from self._fresh
 
     def close(self) -> None:
         self._file.close()
 
 
-def _whole(frame: Frame, row: Any) -> Any:
-    prior = frame.prior
-    row["seq"], row["segment"] = frame.seq, frame.segment
-    row["T_odom_camera"] = frame.T_odom_camera if frame.is_placed else np.nan
-    row["sigma_turn_rad"] = prior.sigma_tilt_rad, prior.sigma_yaw_rad
-    for name in ("R_world_camera", "position_m", "sigma_position_m"):
-        value = getattr(prior, name)
-        row[name] = np.nan if value is None else value
-    return row
+def _known(frame: Frame) -> dict[str, Any]:
+    """What places a frame that no longer changes."""
+    return {
+        "time_ns": frame.time_ns,
+        "seq": frame.seq,
+        "prior": frame.prior,
+        "state": frame.state,
+        "segment": frame.segment,
+        "T_keyframe_camera": frame.T_odom_camera if frame.is_placed else None,
+    }
 
 
 def _crc(record: PoseRecord) -> int:
+    """The record's own, its last four bytes."""
     return int.from_bytes(pack_pose(record)[-4:], "little")
-
-
-def _frame(row: Any) -> Frame:
-    """The frame of a row, with all that places it."""
-    T, R, position, sigma = (
-        None if np.isnan(row[name]).any() else row[name]
-        for name in ("T_odom_camera", "R_world_camera", "position_m", "sigma_position_m")
-    )
-    prior = PosePrior(R, *row["sigma_turn_rad"].tolist(), position, sigma)
-    state = Tracking.LOST if T is None else Tracking.TRACKED
-    return Frame(
-        NO_IMAGE, int(row["time_ns"]), int(row["seq"]), prior, state=state,
-        segment=int(row["segment"]), T_keyframe_camera=T,
-    )  # fmt: skip
 
 
 class Recorder:
@@ -167,13 +143,8 @@ class Recorder:
         pose, frame = posed.pose, posed.frame
         if pose is None:
             return
-        time_ns = frame.time_ns + self._offset_ns
-        self.last = self._record(time_ns, pose, agl_m, frame.seq if posed.is_view else None)
-        row = np.zeros((), FRAME)
-        row["time_ns"], row["is_view"] = time_ns, posed.is_view
-        row["agl_m"] = np.nan if agl_m is None else agl_m
-        row["crc"] = _crc(self.last)
-        self._frames.add(frame, row, self.mapper.is_settled)
+        self.last = self._record(frame, pose, agl_m, posed.is_view)
+        self._frames.add(frame, (posed.is_view, agl_m, _crc(self.last)), self.mapper.is_settled)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
             self._write_due()
@@ -212,16 +183,10 @@ class Recorder:
             self.store.add_poses(batch)
 
     def _changed(self) -> Iterator[PoseRecord]:
-        for row in self._frames.rows():
-            frame, agl_m = _frame(row), float(row["agl_m"])
+        for frame, (is_view, agl_m, crc) in self._frames.all():
             pose = self.mapper.frame_poses.place(frame)
-            if pose is None:
-                continue
-            record = self._record(
-                frame.time_ns, pose, None if math.isnan(agl_m) else agl_m,
-                frame.seq if row["is_view"] else None,
-            )  # fmt: skip
-            if _crc(record) != row["crc"]:
+            record = None if pose is None else self._record(frame, pose, agl_m, is_view)
+            if record is not None and _crc(record) != crc:
                 yield record
 
     def summary(self) -> dict[str, Any]:
@@ -327,11 +292,9 @@ class Recorder:
         growth = pose.scale / self._first_scale[seq]
         return Repose(seq, self._revisions[seq], pose.T_world_camera, growth, pose.covariance)
 
-    def _record(
-        self, time_ns: int, pose: Pose, agl_m: float | None, keyframe_seq: int | None
-    ) -> PoseRecord:
+    def _record(self, frame: Frame, pose: Pose, agl_m: float | None, is_view: bool) -> PoseRecord:
         """The pose record of a frame, with speed and turn from the one before it."""
-        T = pose.T_world_camera
+        time_ns, T = frame.time_ns + self._offset_ns, pose.T_world_camera
         roll, pitch, yaw = attitude_of(T)
         speed = turn = 0.0
         if self._last is not None and time_ns > self._last[0]:
@@ -363,7 +326,7 @@ class Recorder:
             turn_rate_rad_s=turn,
             sources=pose.sources,
             sigma_m=sigma_m(pose),
-            keyframe_seq=keyframe_seq,
+            keyframe_seq=frame.seq if is_view else None,
         )
 
 

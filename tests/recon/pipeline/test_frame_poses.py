@@ -12,7 +12,7 @@ from some_views import keyframe_at, view_at
 
 from recon import se3
 from recon.backends.cpu import CpuBackend
-from recon.pipeline.frame_poses import FramePoses, pose_at
+from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import untimed
 from recon.posegraph.alignment_readings import Alignment
@@ -51,10 +51,7 @@ def following() -> Any:
         sigma = None if fix is None else np.full(3, 5.0)
         prior = PosePrior(position_m=fix, sigma_position_m=sigma)
         pose = placed(frames, prior, frame_at(seq, north_m))
-        place_m = pose.T_world_camera[:3, 3]
-        frame = frame_at(seq, north_m)
-        published = pose_at(frame.T_odom_camera, place_m, np.full(3, sigma_m(pose) / 3**0.5))
-        again = frames.pose(frame, published)
+        again = placed(frames, prior, frame_at(seq, north_m))
         np.testing.assert_allclose(again.T_world_camera, pose.T_world_camera)
         assert sigma_m(again) == pytest.approx(sigma_m(pose))
         return pose
@@ -140,18 +137,17 @@ def test_views_keep_their_places_when_they_settle() -> None:
     for key in keys:
         frames.add_view(relative(key.seq, key.segment, some_pose(), key), pose)
     taken = [relative(n, n // 50, some_pose(), keys[n // 10]) for n in range(100)]
-    fallback = pose_at(np.eye(4), np.zeros(3), np.ones(3))
-    before = [frames.pose(frame, fallback) for frame in taken]
+    before = [placed(frames, PosePrior(), frame) for frame in taken]
     frames.settle()
-    after = [frames.pose(frame, fallback) for frame in taken]
+    after = [placed(frames, PosePrior(), frame) for frame in taken]
     for one, other in zip(before, after, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera)
     fixed = [relative(n, n // 50, taken[n].T_odom_camera) for n in (55, 85)]
     keys[5].T_camera_odom = keys[8].T_camera_odom = some_pose()
-    settled, open_ = (frames.pose(frame, fallback).T_world_camera for frame in fixed)
+    settled, open_ = (placed(frames, PosePrior(), frame).T_world_camera for frame in fixed)
     np.testing.assert_array_equal(settled, after[55].T_world_camera)
     assert not np.allclose(open_, after[85].T_world_camera)  # its view is still adjusted
-    alone = frames.pose(relative(0, 7, np.eye(4)), fallback)
+    alone = placed(frames, PosePrior(), relative(0, 7, np.eye(4)))
     np.testing.assert_array_equal(alone.T_world_camera[:3, 3], np.zeros(3))
 
 
@@ -164,17 +160,17 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     assert placed(frames, PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
     known, trajectory = keyframes.add(view_at(5, view.T_odom_camera), None), keyframes.trajectory
     keyframes.trajectory = None
-    fallback = pose_at(np.eye(4), np.full(3, 9.0), np.ones(3))
-    np.testing.assert_array_equal(frames.pose(frame, fallback).T_world_camera[:3, 3], np.full(3, 9))
+    waiting = placed(frames, PosePrior(), frame)
+    np.testing.assert_allclose(waiting.T_world_camera, frame.T_odom_camera)
     frames.add_view(view, known)  # the view is done
     step = se3.inverse(view.T_odom_camera) @ frame.T_odom_camera
     step[:3, 3] *= known.scale
-    found = frames.pose(frame, fallback)
+    found = placed(frames, PosePrior(), frame)
     np.testing.assert_allclose(found.T_world_camera, known.T_world_camera @ step, atol=1e-12)
     keyframes.trajectory = trajectory
     assert keyframes.trajectory.moved(final=True) == {}
     frames.finish()
-    again = frames.pose(frame, fallback)
+    again = placed(frames, PosePrior(), frame)
     np.testing.assert_allclose(again.T_world_camera, found.T_world_camera, atol=1e-9)
 
 
