@@ -68,6 +68,9 @@ class ExposureWatch:
     def __init__(self) -> None:
         self._streaks: deque[tuple[float, float]] = deque(maxlen=KEPT)  # px, px/s
         self._over_motion: deque[float] = deque(maxlen=KEPT)  # streak over that of an open shutter
+        self.exposure_s: float | None = None  # by the images; None while too few show it
+        self.shown_s = 0.0  # the exposure where it smears the images; 0: as sharp as others
+        self.blur_px = 0.0  # median streak of the last keyframes; 0 where it does no harm
         # The strongest ``blur_px`` so far, and the exposure in s then; None while images are sharp.
         self.strongest: tuple[float, float] | None = None
         self.is_of_motion = True  # the strongest
@@ -79,34 +82,16 @@ class ExposureWatch:
         if speed * gap_s < SHOWN_PX:
             return
         streak = streak_px(gray, px_s / speed)
-        if np.isfinite(streak):  # no frame is exposed for longer than until the next
-            self._streaks.append((min(streak, speed * gap_s), speed))
-            self._over_motion.append(streak / (speed * image_gap_s))
-            blur_px, exposure_s = self.blur_px, self.exposure_s
-            if exposure_s is not None and blur_px > (self.strongest or (0.0, 0.0))[0]:
-                self.strongest = blur_px, exposure_s
-                self.is_of_motion = float(np.median(self._over_motion)) < MOTION_SHARE
-
-    @property
-    def exposure_s(self) -> float | None:
-        """By the images; None while too few show it."""
+        if not np.isfinite(streak):
+            return
+        self._streaks.append((min(streak, speed * gap_s), speed))  # exposed until the next at most
+        self._over_motion.append(streak / (speed * image_gap_s))
         if len(self._streaks) < MIN_KNOWN:
-            return None
-        return float(np.median([streak / speed for streak, speed in self._streaks]))
-
-    @property
-    def shown_s(self) -> float:
-        """The exposure where it smears the images; 0 where they are as sharp as others."""
-        exposure_s = self.exposure_s
-        return exposure_s if exposure_s is not None and self._typical > SHOWN_PX else 0.0
-
-    @property
-    def _typical(self) -> float:
-        return float(np.median([streak for streak, _ in self._streaks]))
-
-    @property
-    def blur_px(self) -> float:
-        """Median streak of the last keyframes; 0 where it does no harm."""
-        if len(self._streaks) < MIN_KNOWN:
-            return 0.0
-        return self._typical if self._typical > SLOW_PX else 0.0
+            return
+        px, speeds = np.array(self._streaks).T
+        typical, self.exposure_s = float(np.median(px)), float(np.median(px / speeds))
+        self.shown_s = self.exposure_s if typical > SHOWN_PX else 0.0
+        self.blur_px = typical if typical > SLOW_PX else 0.0
+        if self.blur_px > (self.strongest or (0.0, 0.0))[0]:
+            self.strongest = self.blur_px, self.exposure_s
+            self.is_of_motion = float(np.median(self._over_motion)) < MOTION_SHARE
