@@ -44,7 +44,7 @@ class FramePoses:
             self._settled += 1
 
     def finish(self) -> None:
-        """Place frames by the whole graph from now on, all of them anew in the order of time."""
+        """Place frames by the whole graph from now on, all of them again in the order of time."""
         self._newest = self._seen = None
         self._fallbacks.clear()
 

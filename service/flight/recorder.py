@@ -174,8 +174,8 @@ class Recorder:
 
     def _correct_trajectory(self) -> None:
         """Write every pose again that differs from the published one, by however little: that one
-        hangs on how many keyframes were done when its frame came, and what a scan holds must not
-        depend on how fast the computer was. The newest of a time holds."""
+        depends on how many keyframes were done when its frame came, and so on how fast the
+        computer was; what a scan holds must not. The newest of a time holds."""
         self._write_due()
         self._last, self.distance_m = None, 0.0
         changed = self._changed()
