@@ -161,8 +161,8 @@ def stored_by(folder: Path, delay: int) -> list[PoseRecord]:
             T_odom = None if is_lost else T
             frame = replace(view.frame, time_ns=seq * 10**9, state=state, T_keyframe_camera=T_odom)
             recorder.write([FramePosed(frame, frames.place(frame))])
-        for _, *late in done:
-            frames.add_view(*late)
+        for _, late, its_pose in done:
+            frames.add_view(late, its_pose)
 
         def finish() -> tuple[()]:
             keyframes.trajectory.moved(final=True)
