@@ -125,7 +125,7 @@ def _outcome(trial: Trial, emulators: Sequence[LinkEmulator], made: Times, came:
         if item in came and _is_up(trial.link, at - emulators[0].started):
             latency.setdefault(item[1], []).append(came[item] - at)
     budget = trial.link.rate_kbit_s * 125 * SHARE
-    busiest = max(emulator.up.busiest_window_bytes() for emulator in emulators) / budget
+    busiest = max(emulator.up.busiest_second_bytes() for emulator in emulators) / budget
     delivered = sum(item in came for item in made)
     return Outcome(delivered, len(made), busiest, [
         ("delivered of what was made", 100 * delivered / len(made), "%"),

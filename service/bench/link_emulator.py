@@ -16,7 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 SEGMENT_BYTES = 1400
 SEGMENT_HEADER_BYTES = 52
@@ -41,37 +41,30 @@ class LinkModel:
     seed: int = 1
 
 
-@dataclass(slots=True, eq=False)
-class Traffic:
-    """Traffic of one direction: (time, bytes on the wire) as handed to the link."""
-
-    log: list[tuple[float, int]] = field(default_factory=list)
-
-    def total_bytes(self) -> int:
-        return sum(size for _, size in self.log)
-
-    def busiest_window_bytes(self, window_s: float = 1.0) -> int:
-        """The most bytes in any window of that length."""
-        most = held = 0
-        window: deque[tuple[float, int]] = deque()
-        for at, size in self.log:
-            window.append((at, size))
-            held += size
-            while window[0][0] <= at - window_s:
-                held -= window.popleft()[1]
-            most = max(most, held)
-        return most
-
-
 class Direction:
     """One direction of the link: serialised at the rate, delayed, lost, cut."""
 
     def __init__(self, model: LinkModel, started: float, seed: int) -> None:
         self._model = model
         self.started = started
+        self.traffic: list[tuple[float, int]] = []  # time, bytes on the wire handed to the link
         self._random = random.Random(seed)
         self._free_at = started
-        self.traffic = Traffic()
+
+    def total_bytes(self) -> int:
+        return sum(size for _, size in self.traffic)
+
+    def busiest_second_bytes(self) -> int:
+        """The most bytes in any second."""
+        most = held = 0
+        window: deque[tuple[float, int]] = deque()
+        for at, size in self.traffic:
+            window.append((at, size))
+            held += size
+            while window[0][0] <= at - 1.0:
+                held -= window.popleft()[1]
+            most = max(most, held)
+        return most
 
     def backlog_bytes(self, now: float) -> float:
         """Bytes that wait for the radio."""
@@ -96,7 +89,7 @@ class Direction:
     def send(self, size: int, now: float) -> float:
         """When ``size`` bytes come out at the far end."""
         wire = size + SEGMENT_HEADER_BYTES * -(-size // SEGMENT_BYTES)
-        self.traffic.log.append((now, wire))
+        self.traffic.append((now, wire))
         begin = max(now, self._free_at)
         self._free_at = begin + wire / (self._model.rate_kbit_s * 125)
         if self._random.random() < self._model.loss:  # again a round trip later; the rest waits
@@ -107,7 +100,7 @@ class Direction:
 
 class LinkEmulator:
     """Relays ``listen_port`` to ``target_port`` of this machine through a :class:`LinkModel`.
-    :attr:`up` is the traffic from the side that calls, the drone."""
+    :attr:`up` is the direction from the side that calls, the drone."""
 
     def __init__(
         self,
@@ -120,18 +113,16 @@ class LinkEmulator:
         self._model, self._clock = model, clock
         self._ports = listen_port, target_port
         self.started = clock()
-        self._up = Direction(model, self.started, model.seed)
+        self.up = Direction(model, self.started, model.seed)
         self._down = Direction(model, self.started, model.seed + 1)
-        self.up = self._up.traffic
         self._loop = loop or asyncio.new_event_loop()
         self._ready = threading.Event()
         self._thread = threading.Thread(target=self._run, name="link-emulator", daemon=True)
 
     def take_off(self, now: float) -> None:
         """Count the times of the cuts from now on, and forget the traffic so far."""
-        self.started = self._up.started = self._down.started = now
-        self._up.traffic.log.clear()
-        self._down.traffic.log.clear()
+        self.started = self.up.started = self._down.started = now
+        self.up.traffic.clear()
 
     def start(self) -> None:
         self._thread.start()
@@ -159,14 +150,14 @@ class LinkEmulator:
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         now = self._clock()
-        await asyncio.sleep(self._up.resumes(now, FIRST_WAIT_S) - now)
+        await asyncio.sleep(self.up.resumes(now, FIRST_WAIT_S) - now)
         try:
             far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._ports[1])
         except OSError:
             writer.close()
             return
         await asyncio.gather(
-            self.relay(reader, far_writer, self._up), self.relay(far_reader, writer, self._down)
+            self.relay(reader, far_writer, self.up), self.relay(far_reader, writer, self._down)
         )
 
     async def relay(

@@ -76,8 +76,9 @@ def make_video(path: Path, frames: int) -> None:
             tilt = 0.98 * tilt + rng.normal(0, 0.001, 3)
             centre = np.array([60.0 + SPEED_M_S * i / FPS, 50.0, HEIGHT_M])
             R = se3.so3_exp(tilt) @ np.diag([1.0, -1, -1])
-            image = _photograph(ground, se3.compose(R, centre))
-            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+            plane = np.column_stack([M_PER_PX * np.eye(3, 2), -centre])  # of a pixel of the ground
+            image = cv2.warpPerspective(ground, K @ R.T @ plane, SIZE, flags=cv2.INTER_AREA)
+            frame = av.VideoFrame.from_ndarray(np.asarray(image, np.uint8), format="bgr24")
             for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode(None):
@@ -95,13 +96,6 @@ def _ground(length_px: int) -> U8:
     out = (out - out.mean()) / out.std() * 40 + 120
     gray = np.clip(out, 0, 255).astype(np.uint8)
     return np.stack([gray, gray, gray], axis=-1)
-
-
-def _photograph(ground: U8, T_world_camera: F64) -> U8:
-    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    plane = np.diag([M_PER_PX, M_PER_PX, 1.0])
-    H = K @ R.T @ (np.column_stack([np.eye(3)[:, 0], np.eye(3)[:, 1], -t]) @ plane)
-    return np.asarray(cv2.warpPerspective(ground, H, SIZE, flags=cv2.INTER_AREA), np.uint8)
 
 
 def fly(

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from service.bench.link_emulator import Direction, LinkEmulator, LinkModel, Traffic
+from service.bench.link_emulator import Direction, LinkEmulator, LinkModel
 
 WIRE = 1400 + 52
 
@@ -56,9 +56,10 @@ def test_a_stream_with_losses_keeps_its_order_and_its_last_bytes() -> None:
 
 
 def test_the_busiest_window_is_found() -> None:
-    traffic = Traffic([(0.0, 10), (0.9, 20), (1.5, 30), (1.8, 40), (5.0, 5)])
-    assert traffic.busiest_window_bytes() == 90
-    assert traffic.total_bytes() == 105
+    pipe = Direction(LinkModel(), 0.0, 1)
+    pipe.traffic += [(0.0, 10), (0.9, 20), (1.5, 30), (1.8, 40), (5.0, 5)]
+    assert pipe.busiest_second_bytes() == 90
+    assert pipe.total_bytes() == 105
 
 
 def test_a_short_trial_with_a_cut_delivers_everything() -> None:
