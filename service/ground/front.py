@@ -126,9 +126,7 @@ class Front:
         return own < MAX_OF_ADDRESS and total < MAX_HANDSHAKES + (0 if own else KEPT)
 
     def _end_handshake(self, network: str) -> None:
-        self._handshakes[network] -= 1
-        if not self._handshakes[network]:
-            del self._handshakes[network]
+        self._handshakes -= Counter([network])  # which keeps no network without any
 
 
 async def _exchange(outer: Stream, inner: Stream, admit: Callable[[], None]) -> bool:

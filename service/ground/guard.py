@@ -322,7 +322,8 @@ def _is_tls(connection: HTTPConnection) -> bool:
 
 
 WHO = "skyrelief.who"
-"""Key of a request's scope for its sender; None without a token."""
+"""Key of a request's scope for its sender: NAME of a token's holder, or NAME.BROWSER of a session;
+None for anybody else."""
 
 CHANGING = {"POST", "PATCH", "DELETE", "PUT"}
 HEADERS = {
@@ -353,8 +354,13 @@ class Guard:
             return
         connection = HTTPConnection(scope)
         session = connection.cookies.get(cookie_name(connection)) or ""
-        who = scope[WHO] = self._who(connection, session)
-        send = _with_headers(send, *self._renewal(connection, session))
+        bearer = connection.headers.get("authorization", "").removeprefix("Bearer ")
+        who = self._tokens.name_of(bearer) if bearer else self._tokens.holder_of(session)
+        scope[WHO] = who
+        renewal, following = Response(), self._tokens.renewed(session)
+        if following is not None:
+            _set_cookie(renewal, connection, following)
+        send = _with_headers(send, renewal.headers.getlist("set-cookie"))
         opening = scope["path"] == "/" and "token" in connection.query_params
         refusal = self._refusal(connection, who, opening)
         if refusal is not None:
@@ -370,20 +376,6 @@ class Guard:
             await self._change(connection, receive, send, str(who))
         else:
             await self._app(scope, receive, send)
-
-    def _who(self, connection: HTTPConnection, session: str) -> str | None:
-        """NAME of a token's holder, or NAME.BROWSER of a session's; None for anybody else."""
-        bearer = connection.headers.get("authorization", "").removeprefix("Bearer ")
-        if bearer:
-            return self._tokens.name_of(bearer)
-        return self._tokens.holder_of(session)
-
-    def _renewal(self, connection: HTTPConnection, session: str) -> list[tuple[str, str]]:
-        """The header with the session's next cookie when it is due."""
-        answer, following = Response(), self._tokens.renewed(session)
-        if following is not None:
-            _set_cookie(answer, connection, following)
-        return [(name, value) for name, value in answer.headers.items() if name == "set-cookie"]
 
     def _refusal(
         self, connection: HTTPConnection, who: str | None, opening: bool
@@ -461,16 +453,16 @@ def where(connection: HTTPConnection) -> str:
     return connection.client.host if connection.client is not None else ""
 
 
-def _with_headers(send: Send, *more: tuple[str, str]) -> Send:
-    """``send`` that puts the safety headers, and more, on every answer."""
+def _with_headers(send: Send, cookies: list[str]) -> Send:
+    """``send`` that puts the safety headers, and cookies, on every answer."""
 
     async def wrapped(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
             for name, value in HEADERS.items():
                 headers.setdefault(name, value)
-            for name, value in more:
-                headers.append(name, value)
+            for cookie in cookies:
+                headers.append("set-cookie", cookie)
         await send(message)
 
     return wrapped

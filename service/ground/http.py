@@ -367,7 +367,8 @@ def _import(request: Request, order: ImportOrder) -> Response:
     if not order.folder or "\0" in order.folder:
         raise InputError("give the folder or the .mcap to import")
     state = state_of(request)
-    drone, scan = state.library.bring_in(Path(order.folder))
+    with state.library.importing():
+        drone, scan = state.library.take(Path(order.folder))
     state.ended(state.library.folder(drone, scan))
     note(request, "import", scan=f"{drone}/{scan}")
     return JSONResponse({"drone": drone, "scan": scan}, 201)

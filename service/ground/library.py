@@ -210,11 +210,6 @@ class Library:
             _move(folder, target)
         return parts[0], parts[1]
 
-    def bring_in(self, source: Path) -> tuple[str, str]:
-        """As :meth:`take`. Raises ConflictError while another import runs."""
-        with self.importing():
-            return self.take(source)
-
     @contextlib.contextmanager
     def importing(self) -> Iterator[None]:
         """The time of one import. Raises ConflictError while another one runs."""

@@ -189,7 +189,10 @@ class LiveMap:
         if keyframe is None:
             empty = np.zeros(0, np.float32)
             return _Points(np.zeros((0, 2)), empty, empty, np.zeros((0, 3), np.uint8))
-        self._choose_zoom(keyframe)
+        sample_m = ground_sample_m(keyframe.depth)
+        if self.zoom is None and sample_m is not None:
+            finest = math.log2(pixel_m(0, self._frame.lat_deg) / max(sample_m, 1e-3))
+            self.zoom = min(max(math.floor(finest), 0), MAX_ZOOM)
         cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh)
         image = self._store.image(seq)
         if image is not None and len(cloud):
@@ -199,13 +202,6 @@ class LiveMap:
         place = on_map(self._frame, cloud.xyz_m[order].astype(np.float64))
         height = np.where(sigma < UNMEASURED_M, place[:, 2], np.nan).astype(np.float32)
         return _Points(place[:, :2], height, sigma, cloud.rgb[order])
-
-    def _choose_zoom(self, keyframe: Keyframe) -> None:
-        sample_m = ground_sample_m(keyframe.depth)
-        if self.zoom is None and sample_m is not None:
-            lat = self._frame.lat_deg
-            finest = math.floor(math.log2(pixel_m(0, lat) / max(sample_m, 1e-3)))
-            self.zoom = min(max(finest, 0), MAX_ZOOM)
 
 
 def unmeasured(keyframe: Keyframe, image: bytes) -> PointCloud:

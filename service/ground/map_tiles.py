@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import zlib
 from pathlib import Path
-from typing import Any
 from xml.sax.saxutils import escape
 
 import cv2
@@ -36,7 +35,7 @@ from service.ground.live_map import (
 )
 from service.ground.scan_facts import is_current
 from service.ground.state import PortalState, folder_of, state_of
-from service.offline.exports.rasters import open_map
+from service.offline.exports.rasters import open_map, warped
 from service.scans.coverage import Coverage
 from service.scans.writing import SUMMARY
 
@@ -166,26 +165,16 @@ def newer_raster(folder: Path, layer: str) -> Path | None:
 
 
 def _from_raster(path: Path, layer: str, tile: Tile) -> Raster:
-    from rasterio.enums import Resampling
     from rasterio.transform import from_origin
-    from rasterio.vrt import WarpedVRT
 
     step = EQUATOR_M / (SIDE << tile[0])
     west = tile[1] * SIDE * step - 0.5 * EQUATOR_M - MARGIN * step
     north = 0.5 * EQUATOR_M - tile[2] * SIDE * step + MARGIN * step
-    options: dict[str, Any] = {
-        "crs": "EPSG:3857",
-        "transform": from_origin(west, north, step, step),
-        "width": WIDE,
-        "height": WIDE,
-        "resampling": Resampling.bilinear,
-    }
+    corner = from_origin(west, north, step, step)
     with open_map(path, 4 if layer == "ortho" else 1) as image:
         if image.crs is None:
             raise MissingError("no map: the scan has no georeference")
-        with WarpedVRT(image, **options) as warped:
-            bands = warped.read()
-        unknown = image.nodata
+        bands, unknown = warped(image, corner, "EPSG:3857", (WIDE, WIDE)), image.nodata
     latitude, _ = degrees(0.5, (tile[2] + 0.5) / (1 << tile[0]))
     grid = Grid(0.0, 0.0, pixel_m(tile[0], latitude), (WIDE, WIDE))
     if layer == "ortho":

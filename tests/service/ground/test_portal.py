@@ -89,7 +89,7 @@ def test_pieces_of_a_scan_are_listed_given_and_imported(
     assert client.ask(f"{ONE}/files/piece-12.laz")[1] == b"piece-12.laz"
     for name in ("piece-x.laz", "piece-2.laz", "piece-0.laz"):
         assert client.ask(f"{ONE}/files/{name}")[0] == 404
-    drone, scan = Library(tmp_path / "other").bring_in(folder)
+    drone, scan = Library(tmp_path / "other").take(folder)
     copied = (tmp_path / "other" / "drones" / drone / scan).glob("piece-*")
     assert sorted(path.name for path in copied) == ["piece-1.laz", "piece-12.laz"]
 

@@ -106,13 +106,17 @@ def test_an_import_holds_no_lock_of_the_library(
         assert go_on.wait(60)
         return copy_files(source, target, names)
 
+    def bring_in() -> None:
+        with library.importing():
+            library.take(card)
+
     monkeypatch.setattr("service.ground.library.copy_files", slow)
-    importing = threading.Thread(target=library.bring_in, args=(card,))
+    importing = threading.Thread(target=bring_in)
     importing.start()
     try:
         assert begun.wait(60)
         with pytest.raises(ConflictError, match="another import"):
-            library.bring_in(card)
+            bring_in()
         name = library.bin()[0]
         library.restore(name)
         library.label("drone-1", "test-1", "meanwhile", None, None)
