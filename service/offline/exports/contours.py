@@ -189,6 +189,7 @@ def contour_lines(
     mine = np.zeros_like(shown)
     mine[rows.start : rows.stop + 1, cols.start : cols.stop + 1] = True
     shown &= mine
+    shown[[0, 1, -2, -1]] = shown[:, [0, 1, -2, -1]] = False  # where loops follow the grid
     slope = np.gradient(smooth)
     for n in range(math.ceil(low / step_m), math.floor(high / step_m) + 1):
         above = (smooth >= n * step_m).astype(np.uint8)
@@ -196,8 +197,7 @@ def contour_lines(
         loops, _ = cv2.findContours(above, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         for loop in loops:
             cells = loop[:, 0]
-            inner = shown[cells[:, 1], cells[:, 0]] & _off_border(cells, smooth.shape)
-            for run in _stretches(cells, inner):
+            for run in _stretches(cells, shown[cells[:, 1], cells[:, 0]]):
                 line = _at_level(run.astype(np.float64), smooth, slope, n * step_m)
                 line = cv2.approxPolyDP(
                     line.astype(np.float32)[:, None], TOLERANCE_M / grid.cell_m, False
@@ -213,12 +213,6 @@ def _objects(ground: BareGround, cell_m: float) -> Bool:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (across, across))
     hidden = ground.is_bridged.astype(np.uint8)
     return np.asarray(cv2.morphologyEx(hidden, cv2.MORPH_OPEN, disc) > 0)
-
-
-def _off_border(cells: Array, shape: tuple[int, ...]) -> Bool:
-    """(N,) which cells (column, row) are none of the outermost two, where loops follow the grid."""
-    x, y = cells.T
-    return np.asarray((x > 1) & (y > 1) & (x < shape[1] - 2) & (y < shape[0] - 2))
 
 
 def _at_level(line: F64, smooth: F32, slope: list[F32], height_m: float) -> F64:

@@ -42,8 +42,8 @@ GCP = "gcp.csv"
 MAX_IMAGES = 12
 """Images offered for one point."""
 
-MAX_MARKS, MAX_POINTS = 100, 2000
-"""Of one point; of a scan."""
+MAX_MARKS = 100
+"""Of one point."""
 
 GROUND_FROM = 5
 """Keyframes that the height of the ground is taken from."""
@@ -87,8 +87,6 @@ class Marking:
 
     def of(self, survey: Sequence[SurveyPoint]) -> list[Marked]:
         """What is known of each point. Raises InputError for marks that the scan cannot have."""
-        if len(survey) > MAX_POINTS:
-            raise InputError(f"{len(survey)} control points; a scan takes {MAX_POINTS} at most")
         candidates = candidates_of([p for p in survey if p.sightings], self._scan, GCP)
         frame, to_survey = self._placed(candidates)
         why_not = {one.point.name: one.why_not for one in candidates}

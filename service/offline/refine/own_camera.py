@@ -172,7 +172,11 @@ def _overlapping(
     W, H = camera.size_px
     v, u = np.mgrid[0.1:0.9:4j, 0.1:0.9:4j]
     grid = rays(camera.K, np.column_stack([u.ravel() * W, v.ravel() * H]))
-    grounds = np.array([_on_ground(poses[k], grid, ground_m) for k in views])  # (V, 16, 3)
+    T = poses[views]
+    ways = grid @ T[:, :3, :3].transpose(0, 2, 1)
+    down = np.where(ways[..., 2] < -0.1, ways[..., 2], np.nan)  # the others lead to the horizon
+    far = (ground_m - T[:, 2, 3, None]) / down
+    grounds = T[:, None, :3, 3] + ways * far[..., None]  # (V, 16, 3)
     middle = grounds.mean(axis=1)
     reach = np.linalg.norm(grounds - middle[:, None], axis=2).max(axis=1)
     out = {}
@@ -190,13 +194,6 @@ def _overlapping(
         across = [other for _, other in sorted(turned)[:ACROSS]]
         out[k] = [other for other in (*nearby, *across) if other != k]
     return out
-
-
-def _on_ground(T: F64, ways: F64, ground_m: float) -> F64:
-    """(N, 3) where rays (N, 3) of a camera meet the ground; NaN above the horizon."""
-    there = ways @ T[:3, :3].T
-    far = (ground_m - T[2, 3]) / np.where(there[:, 2] < -0.1, there[:, 2], np.nan)
-    return np.asarray(T[:3, 3] + there * far[:, None])
 
 
 def found_camera(

@@ -349,8 +349,5 @@ def waypoints_text(refly: Refly) -> str:
     rows: list[tuple[float, ...]] = [(0, 1, 0, WAYPOINT, 0, 0, 0, 0, *refly.home, 1)]
     for n, i in enumerate(refly.items, 1):
         rows.append((n, 0, i.frame, i.command, *i.params, i.lat_deg, i.lon_deg, i.alt_m, 1))
-    return "QGC WPL 110\n" + "".join("\t".join(_number(v) for v in row) + "\n" for row in rows)
-
-
-def _number(value: float) -> str:
-    return f"{value:.8f}" if isinstance(value, float) else str(value)
+    text = [[f"{v:.8f}" if isinstance(v, float) else str(v) for v in row] for row in rows]
+    return "QGC WPL 110\n" + "".join("\t".join(row) + "\n" for row in text)

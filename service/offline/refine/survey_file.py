@@ -111,8 +111,11 @@ def read_survey(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
     lines = _lines(path)
     if marks is not None or _is_places(lines):
         return _marked(path, lines, marks)
+    rows = _marks if is_list(lines) else _rows
+    if lines and lines[0].lstrip().startswith("<"):
+        rows = _markers
     points: dict[str, SurveyPoint] = {}
-    for line, fields in _reader(lines)(path, lines):
+    for line, fields in rows(path, lines):
         with _fault_in(f"{path} line {line}"):
             point = _point(line, fields)
         before = points.setdefault(point.name, point)
@@ -167,12 +170,6 @@ def _at_time(seen: Sighting, times_unix_s: Mapping[str, float], path: Path) -> S
         return replace(seen, time_unix_s=times_unix_s.get(seen.image, seen.time_unix_s))
     why = "is not in the folder of --video" if times_unix_s else "needs --video with its folder"
     raise InputError(f"{path} line {seen.line}: image {seen.image} {why}")
-
-
-def _reader(lines: Sequence[str]) -> Callable[[Path, Sequence[str]], Iterator[Row]]:
-    if lines and lines[0].lstrip().startswith("<"):
-        return _markers
-    return _marks if is_list(lines) else _rows
 
 
 def _markers(path: Path, lines: Sequence[str]) -> Iterator[Row]:
@@ -274,7 +271,13 @@ def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
     table = csv.reader(lines)
     try:
         header = [name.strip() for name in next(table, [])]
-        _check_header(path, header)
+        known = SurveyRow.__struct_fields__
+        is_whole = {"name", "lat", "lon"} <= set(header) <= set(known)
+        if len(set(header)) < len(header) or not is_whole:
+            raise InputError(
+                f"{path} line 1: columns {', '.join(header)[:200]!r}; name, lat and lon are "
+                f"needed, each once, separated by commas; there are {', '.join(known)}"
+            )
         for cells in table:
             if not any(cell.strip() for cell in cells) or cells[0].startswith("#"):
                 continue
@@ -292,15 +295,6 @@ def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
 def _name(text: str) -> str:
     """A point's name on one line, as a file can keep it."""
     return " ".join(text.split())
-
-
-def _check_header(path: Path, header: list[str]) -> None:
-    known = SurveyRow.__struct_fields__
-    if len(set(header)) < len(header) or not {"name", "lat", "lon"} <= set(header) <= set(known):
-        raise InputError(
-            f"{path} line 1: columns {', '.join(header)[:200]!r}; name, lat and lon are needed, "
-            f"each once, separated by commas; there are {', '.join(known)}"
-        )
 
 
 def _point(line: int, fields: Mapping[str, object]) -> SurveyPoint:

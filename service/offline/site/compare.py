@@ -48,6 +48,7 @@ from service.stream.store import ScanStore
 
 CHANGE_TIF, CHANGE_GPKG = "change.tif", "change.gpkg"
 CHANGE_JSON, CHANGE_PAGE = "change.json", "change.html"
+COLUMNS = ("kind", "area_m2", "volume_m3", "sigma_m3", "mean_m", "peak_m")  # of the GeoPackage
 MARGIN_M = 40.0
 """Around a tile: bending is a mean over 10 m (1 sigma); a smaller object is measured whole."""
 
@@ -102,7 +103,10 @@ def compare(
         with progress.part("comparing the surfaces", 0.7):
             found = changes(view, out, (first, last), options, bare)
         document = _document(site, found, one, two)
-        _write_polygons(view, out / CHANGE_GPKG, found)
+        columns = {name: [each.about[name] for each in found.objects] for name in COLUMNS}
+        shapes = [each.rings for each in found.objects]
+        layer = Layer("changes", "MULTIPOLYGON", shapes, columns)
+        write_layers(out / CHANGE_GPKG, view.needs_place("a GeoPackage").epsg, [layer])
         write_whole(out / CHANGE_PAGE, page(document, found.images))
         write_whole(out / CHANGE_JSON, json.dumps(document, indent=1) + "\n")
     hide_changed(out / "scan.db", site.members[one], out / CHANGE_TIF)
@@ -350,11 +354,3 @@ def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[st
 def _dated(member: Member) -> dict[str, Any]:
     when = dt.datetime.fromtimestamp(member.header.started_unix_ns / 1e9, dt.timezone.utc)
     return {"scan": member.name, "started": when.isoformat(timespec="seconds")}
-
-
-def _write_polygons(view: ScanView, path: Path, change: Changes) -> None:
-    names = ("kind", "area_m2", "volume_m3", "sigma_m3", "mean_m", "peak_m")
-    shapes = [each.rings for each in change.objects]
-    columns = {name: [each.about[name] for each in change.objects] for name in names}
-    layers = [Layer("changes", "MULTIPOLYGON", shapes, columns)]
-    write_layers(path, view.needs_place("a GeoPackage").epsg, layers)

@@ -73,9 +73,15 @@ class FollowedScan:
         self.folder, self.number = folder, number
         self.store = ScanStore.open(folder / "scan.db", read_only=True)
         try:
-            self.origin, self.T_site_scan = _placing(self.store, origin)
             self.is_finished = self.store.finished
             self.started_unix_s = self.store.header.started_unix_ns / 1e9
+            frame = local_frame(self.store.header)
+            if frame is None:
+                raise InputError(f"{self.store.path} has no georeference")
+            self.origin = origin or frame
+            self.T_site_scan = between_frames(self.origin, frame)
+            if np.linalg.norm(self.T_site_scan[:3, 3]) > MAX_DISTANCE_M:
+                raise InputError(f"{self.store.path} lies too far from the other scans")
         except SkyreliefError:
             self.store.close()
             raise
@@ -154,17 +160,6 @@ class FollowedScan:
     def _at(self, k: int) -> Keyframe | None:
         seq = self._seqs[k]
         return self._keyframe(seq, seq in self._fine)  # read again once it is finer
-
-
-def _placing(store: ScanStore, origin: LocalFrame | None) -> tuple[LocalFrame, F64]:
-    """The site's origin, and (4, 4) the motion of the scan's coordinates into it."""
-    frame = local_frame(store.header)
-    if frame is None:
-        raise InputError(f"{store.path} has no georeference")
-    T = between_frames(origin or frame, frame)
-    if np.linalg.norm(T[:3, 3]) > MAX_DISTANCE_M:
-        raise InputError(f"{store.path} lies too far from the other scans")
-    return origin or frame, T
 
 
 class LiveSite:
