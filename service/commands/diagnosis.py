@@ -388,18 +388,15 @@ def examine_links(
     """Messages that each link receives and lacks, by listening or from the running service."""
     if not config.mavlink.links:
         yield Finding("mavlink", NOTE, "mavlink.links is empty: no telemetry, no commands")
-    elif running is not None:
-        yield from _of_service(running.get("mavlink", {}))
-    else:
+    elif running is None:
         yield from _by_listening(config, listen_s)
-
-
-def _of_service(heard: dict[str, Any]) -> Iterator[Finding]:
-    up, packets = heard.get("links_up", 0), heard.get("packets", 0)
-    text = f"held by the running service: {up} open, {packets} messages heard"
-    yield Finding("mavlink", GOOD if packets else NOTE, text)
-    for trouble in heard.get("troubles", ()):
-        yield _trouble(trouble["what"], trouble["text"], trouble["is_grave"])
+    else:
+        heard = running.get("mavlink", {})
+        up, packets = heard.get("links_up", 0), heard.get("packets", 0)
+        text = f"held by the running service: {up} open, {packets} messages heard"
+        yield Finding("mavlink", GOOD if packets else NOTE, text)
+        for trouble in heard.get("troubles", ()):
+            yield _trouble(trouble["what"], trouble["text"], trouble["is_grave"])
 
 
 def _by_listening(config: Config, listen_s: float) -> Iterator[Finding]:

@@ -148,12 +148,15 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
         store = create_store(inputs)
         try:
             scan = Scan(inputs, store)
-            scan.run(Event(), is_enough=_is_enough)
+            made = scan.recorder
+            scan.run(
+                Event(), is_enough=lambda _: made.keyframes >= VIEWS or made.frames >= MAX_FRAMES
+            )
             scan.close()
         finally:
             store.close()
-        if scan.recorder.keyframes < MIN_IMAGES:
-            return f"{scan.recorder.keyframes} keyframes are too few; {MIN_IMAGES} needed"
+        if made.keyframes < MIN_IMAGES:
+            return f"{made.keyframes} keyframes are too few; {MIN_IMAGES} needed"
         try:
             return lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:
@@ -168,10 +171,6 @@ def still_assumed(found: SelfCalibrated) -> tuple[str, ...]:
 
     bend = corner_bend(found.camera, found.sigma_k[0])
     return ("distortion",) if bend > MAX_SIGMA_BEND else ()
-
-
-def _is_enough(scan: Scan) -> bool:
-    return scan.recorder.keyframes >= VIEWS or scan.recorder.frames >= MAX_FRAMES
 
 
 def with_stated_readout(

@@ -166,7 +166,12 @@ def refly(
     from service.scans.writing import check_writable, write_whole
 
     path = out or scan_dir / "refly.plan"
-    _check_refly(path, overlap, views, sigma_m)
+    if path.suffix not in (".plan", ".waypoints"):
+        raise InputError(f"--out {path}: name it .plan (QGroundControl) or .waypoints")
+    if (views is not None and views < 1) or (sigma_m is not None and not sigma_m > 0):
+        raise InputError("--views must be at least 1 and --sigma-m positive")
+    if not 0.0 <= overlap <= 0.9:
+        raise InputError(f"--overlap {overlap:g}: give 0 to 0.9")
     if scan_dir.is_dir():
         check_writable(path)
     with ScanView(scan_dir) as scan:
@@ -184,15 +189,6 @@ def refly(
         return
     write_whole(path, waypoints_text(flight) if path.suffix == ".waypoints" else plan_json(flight))
     print(json.dumps(_flight_figures(path, flight)) if as_json else _flight_line(path, flight))
-
-
-def _check_refly(path: Path, overlap: float, views: int | None, sigma_m: float | None) -> None:
-    if path.suffix not in (".plan", ".waypoints"):
-        raise InputError(f"--out {path}: name it .plan (QGroundControl) or .waypoints")
-    if (views is not None and views < 1) or (sigma_m is not None and not sigma_m > 0):
-        raise InputError("--views must be at least 1 and --sigma-m positive")
-    if not 0.0 <= overlap <= 0.9:
-        raise InputError(f"--overlap {overlap:g}: give 0 to 0.9")
 
 
 def _flight_figures(path: Path, flight: Refly) -> dict[str, Any]:

@@ -112,8 +112,12 @@ def replay(
         is_latency_given = is_given(LATENCY, config, overrides)
         unsure: set[str] = set()
         if not realtime and parse_source(video)[0] == "file":
+            # What its images may correct; then its scan begins again.
+            unsure = {"readout", "mount"}
             is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)
-            unsure = _unsure(log, is_clock_given)
+            is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
+            if not (is_of_camera or is_clock_given):
+                unsure |= {"clock", "clock's rate"}
         with nullcontext(Progress()) if as_json else showing("replay") as progress:
             if start is not None:
                 find = find_lens and not realtime
@@ -172,14 +176,6 @@ def _lens(
         lens = start.camera
     check_width(lens, source.description)
     return start, lens, notes
-
-
-def _unsure(log: TelemetryLog | None, is_clock_given: bool) -> set[str]:
-    """What the images of a recording may correct: then its scan begins again."""
-    of_images = {"readout", "mount"}
-    is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
-    is_sure = is_of_camera or is_clock_given
-    return of_images if is_sure else of_images | {"clock", "clock's rate"}
 
 
 def _corrected(

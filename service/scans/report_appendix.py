@@ -57,14 +57,17 @@ def appendix(
         *consistency(summary, poses),
         "<h3>The flight over time</h3>",
         *_curves(poses),
-        *_stages(keyframe),
+        *([] if keyframe is None else ["<h3>A keyframe</h3>", figure(
+            embedded(keyframe, quality=85),
+            "Stages of a keyframe in the middle; all of them with scan.keep_debug=true.",
+        )]),
         "<h3>Speeds and faults</h3>",
         table(_rows(run, SPEEDS)),
         _counted("Not used for stereo", run.get("refusals")),
         _counted("Readings left out of the pose graph", (run.get("graph") or {}).get("left_out")),
         _counted("Clouds registered", run.get("registrations")),
         _counted("Milliseconds per call of each stage", run.get("stage_ms")),
-    ]
+    ]  # fmt: skip
 
 
 def _cloud(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -94,13 +97,6 @@ def sensor_constants(graph: dict[str, Any]) -> list[tuple[str, str]]:
     if datum is not None and datum["shift_m"]:
         rows.append(("altitude raised to the receiver's", f"{datum['shift_m']:+.2f} m"))
     return rows
-
-
-def _stages(image: U8 | None) -> list[str]:
-    if image is None:
-        return []
-    words = "Stages of a keyframe in the middle; all of them with scan.keep_debug=true."
-    return ["<h3>A keyframe</h3>", figure(embedded(image, quality=85), words)]
 
 
 def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:

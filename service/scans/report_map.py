@@ -35,7 +35,11 @@ def map_figure(
     track = np.array([p.T_world_camera[:2, 3] for p in poses]).reshape(-1, 2)
     grown = 1
     if len(track):
-        parts.append(_polyline(_px(view, track), TRACK))
+        shown = _px(view, track[:: max(1, len(track) // 1500)])
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in shown)
+        parts.append(
+            f'<polyline fill="none" stroke="{TRACK}" stroke-width="1.2" points="{points}"/>'
+        )
         ellipses, grown = _ellipses(poses, view)
         parts += ellipses
         parts += _loops(summary, poses, view)
@@ -74,12 +78,6 @@ def _ground(coverage: Coverage, view: Grid) -> str:
         f'preserveAspectRatio="none" style="image-rendering:pixelated" '
         f'href="data:image/png;base64,{code}"/>'
     )
-
-
-def _polyline(px: F64, colour: str) -> str:
-    step = max(1, len(px) // 1500)
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in px[::step])
-    return f'<polyline fill="none" stroke="{colour}" stroke-width="1.2" points="{points}"/>'
 
 
 def _ellipses(poses: Sequence[PoseRecord], view: Grid) -> tuple[list[str], int]:

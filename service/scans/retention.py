@@ -60,15 +60,11 @@ def close_open_scans(
     return closed
 
 
-def free_bytes(folder: Path) -> int:
-    return shutil.disk_usage(folder).free
-
-
 def make_room(
     folder: Path,
     keep_free_mib: float,
     keep: Container[str] = (),
-    free: Callable[[Path], int] = free_bytes,
+    free: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
 ) -> list[str]:
     """Delete the oldest finished scans until ``keep_free_mib`` are free; returns their names. Scans
     in ``keep`` and open ones stay."""
