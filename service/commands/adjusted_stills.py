@@ -29,7 +29,6 @@ from recon.types import F64, U8, Camera, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter
 from service.cameras.images import ImagesSource
 from service.cameras.rig import Rig, turn_sigma_rad_s
-from service.cameras.source import CameraFrame
 from service.config import change
 from service.errors import InputError
 from service.flight.pipeline import mapper_config
@@ -111,18 +110,15 @@ def _tracked(
         check.add(time_ns, tracked)
         if late:
             out[-1] = replace(out[-1], is_tracked=True)
-        out.append(Still(frame.seq, _small(frame), frame.time_ns, tracked.is_placed))
+        gray = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        H, W = gray.shape
+        if W > WIDTH_PX:
+            size = WIDTH_PX, round(H * WIDTH_PX / W)
+            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+        small = np.asarray(gray, np.uint8)
+        out.append(Still(frame.seq, small, frame.time_ns, tracked.is_placed))
     check.finish()
     return out, check.latency
-
-
-def _small(frame: CameraFrame) -> U8:
-    gray = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
-    H, W = gray.shape
-    if W > WIDTH_PX:
-        size = WIDTH_PX, round(H * WIDTH_PX / W)
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(gray, np.uint8)
 
 
 def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHistory) -> ScanInputs:

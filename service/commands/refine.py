@@ -5,15 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from service.commands import AsJson, ScanDir, showing
 from service.errors import InputError
-
-if TYPE_CHECKING:
-    from service.offline.refine.refly import Refly
 
 
 def refine(
@@ -188,27 +185,23 @@ def refly(
         print(json.dumps({"lines": 0, "weak_m2": 0.0, "plan": None}) if as_json else NO_FLIGHT)
         return
     write_whole(path, waypoints_text(flight) if path.suffix == ".waypoints" else plan_json(flight))
-    print(json.dumps(_flight_figures(path, flight)) if as_json else _flight_line(path, flight))
-
-
-def _flight_figures(path: Path, flight: Refly) -> dict[str, Any]:
-    swath = flight.swath
-    return {
-        "plan": str(path),
-        "lines": len(flight.lines),
-        "patches": flight.patches,
-        "weak_m2": round(flight.weak_m2, 1),
-        "length_m": round(flight.length_m, 1),
-        "seconds": flight.seconds,
-        "spacing_m": round(flight.spacing_m, 1),
-        "altitude_amsl_m": round(swath.altitude_amsl_m, 1),
-        "picture_m": [round(swath.across_m, 1), round(swath.along_m, 1)],
-    }
-
-
-def _flight_line(path: Path, flight: Refly) -> str:
-    return (
-        f"{path}: {len(flight.lines)} line(s) over {flight.weak_m2:.0f} m2 in {flight.patches} "
-        f"place(s), {flight.length_m:.0f} m, {flight.seconds} s at "
-        f"{flight.swath.speed_m_s:.1f} m/s, {flight.swath.altitude_amsl_m:.0f} m above sea level"
-    )
+    swath, lines = flight.swath, len(flight.lines)
+    if as_json:
+        figures = {
+            "plan": str(path),
+            "lines": lines,
+            "patches": flight.patches,
+            "weak_m2": round(flight.weak_m2, 1),
+            "length_m": round(flight.length_m, 1),
+            "seconds": flight.seconds,
+            "spacing_m": round(flight.spacing_m, 1),
+            "altitude_amsl_m": round(swath.altitude_amsl_m, 1),
+            "picture_m": [round(swath.across_m, 1), round(swath.along_m, 1)],
+        }
+        print(json.dumps(figures))
+    else:
+        print(
+            f"{path}: {lines} line(s) over {flight.weak_m2:.0f} m2 in {flight.patches} place(s), "
+            f"{flight.length_m:.0f} m, {flight.seconds} s at {swath.speed_m_s:.1f} m/s, "
+            f"{swath.altitude_amsl_m:.0f} m above sea level"
+        )

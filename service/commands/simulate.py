@@ -229,14 +229,15 @@ def score(
 ) -> None:
     """Measure accuracy, completeness and trajectory error of a scan of a simulated flight."""
     from service.offline.exports.view import ScanView
-    from service.offline.view_scoring import score_views
+    from service.offline.view_scoring import frame_scores, means
     from service.sim import scoring
 
     with showing("score") as progress:
         if views:
             flight = truth_dir / "flight.mp4"  # of simulate
             with ScanView(scan_dir, progress=progress) as scan:
-                report = score_views(scan, flight if flight.is_file() else truth_dir, images)
+                video = flight if flight.is_file() else truth_dir
+                report = means(frame_scores(scan, video, images))
         else:
             report = scoring.score(scan_dir, truth_dir, progress)
     text = _text_of_views if views else _text

@@ -263,8 +263,13 @@ def status(operator: Operator) -> dict[str, Any]:
     """The companion's report about itself, its scan and its storage."""
     beats: dict[int, dict[str, Any]] = {}
     values: dict[str, float] = {}
+
+    def keep(sender: int, fields: dict[str, Any]) -> None:
+        if sender == ONBOARD:
+            values[str(fields.get("name", ""))] = float(fields.get("value", math.nan))
+
     operator.subscribe("HEARTBEAT", lambda sender, fields: beats.update({sender: fields}))
-    operator.subscribe("NAMED_VALUE_FLOAT", lambda sender, fields: _keep(values, sender, fields))
+    operator.subscribe("NAMED_VALUE_FLOAT", keep)
     capture = operator.request(262, "CAMERA_CAPTURE_STATUS", CAMERA, ANSWER_S)
     storage = operator.request(261, "STORAGE_INFORMATION", CAMERA, ANSWER_S)
     _wait(lambda: ONBOARD in beats, ANSWER_S)
@@ -282,8 +287,3 @@ def status(operator: Operator) -> dict[str, Any]:
         "storage_free_mib": storage.get("available_capacity"),
         "storage_total_mib": storage.get("total_capacity"),
     }
-
-
-def _keep(values: dict[str, float], sender: int, fields: dict[str, Any]) -> None:
-    if sender == ONBOARD:
-        values[str(fields.get("name", ""))] = float(fields.get("value", math.nan))

@@ -92,16 +92,8 @@ class FrameScore(NamedTuple):
 DIGITS = {"covered": 4, "psnr_db": 2, "ssim": 4, "psnr_on_grids_db": 2, "psnr_exposed_db": 2}
 
 
-def score_views(
-    scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {},
-    every: int = EVERY,
-) -> dict[str, Any]:  # fmt: skip
-    """Figures of each product, and of ``others``, at every so many frames of ``video`` that took no
-    part.
-
-    ``images`` is a folder for each frame beside what was drawn of it, as PNG. Raises InputError
-    when the video is not the scan's, or has no such frame.
-    """
+def means(scores: Mapping[str, Sequence[FrameScore]]) -> dict[str, Any]:
+    """Of the frames of each product, ready for JSON, and how many they are."""
     return {
         name: {
             "frames": len(rows),
@@ -110,7 +102,7 @@ def score_views(
                 for figure, values in zip(FrameScore._fields, zip(*rows, strict=True), strict=True)
             },
         }
-        for name, rows in frame_scores(scan, video, images, others, every).items()
+        for name, rows in scores.items()
     }
 
 
@@ -118,9 +110,12 @@ def frame_scores(
     scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {},
     every: int = EVERY, goes_on: Callable[[int], bool] = lambda _: True,
 ) -> dict[str, list[FrameScore]]:  # fmt: skip
-    """Figures of each frame, by product; as ``score_views`` else.
+    """Figures of each product, and of ``others``, at every so many frames of ``video`` that took no
+    part.
 
-    ``goes_on`` is asked with the number of frames that are done.
+    ``images`` is a folder for each frame beside what was drawn of it, as PNG. ``goes_on`` is asked
+    with the number of frames that are done. Raises InputError when the video is not the scan's, or
+    has no such frame.
     """
     with needing("score --views"):
         import open3d  # noqa: F401

@@ -367,7 +367,12 @@ def _quality(
     """Figures of the cloud and the track; None where there is no data."""
     cloud = fused.cloud
     none = not len(cloud)
-    return {
+    names = ("position_sigma_median_m", "position_sigma_h_median_m", "position_sigma_v_median_m")
+    sigmas: dict[str, float | None] = dict.fromkeys(names)  # in all directions, across and up
+    if poses:
+        medians = np.median([(p.sigma_m, *p.sigma_h_v_m) for p in poses], axis=0)
+        sigmas = dict(zip(names, medians.round(4).tolist(), strict=True))
+    return sigmas | {
         "voxel_m": round(fused.voxel_m, 4),
         "ground_sample_m": None
         if fused.ground_sample_m is None
@@ -378,7 +383,7 @@ def _quality(
         "seen_once_share": None if none else round(float((cloud.views <= 1).mean()), 4),
         "area_m2": 0.0 if raster is None else round(raster.area_m2, 1),
         "distance_m": round(float(track.flown_m(poses)[-1]), 2) if poses else 0.0,
-    } | _position_sigmas(poses)
+    }
 
 
 def _absolute_m(cloud: PointCloud, shared: SharedSigma | None) -> float | None:
@@ -387,16 +392,6 @@ def _absolute_m(cloud: PointCloud, shared: SharedSigma | None) -> float | None:
         return None
     some = slice(None, None, 1 + len(cloud) // 200_000)
     return round(float(np.median(shared.absolute_m(cloud.sigma_m[some], cloud.xyz_m[some]))), 4)
-
-
-def _position_sigmas(poses: Sequence[PoseRecord]) -> dict[str, float | None]:
-    """Medians of the sigma of the camera's position: of all three directions together, horizontal
-    and vertical. None without poses."""
-    names = ("position_sigma_median_m", "position_sigma_h_median_m", "position_sigma_v_median_m")
-    if not poses:
-        return dict.fromkeys(names)
-    medians = np.median([(p.sigma_m, *p.sigma_h_v_m) for p in poses], axis=0)
-    return dict(zip(names, medians.round(4).tolist(), strict=True))
 
 
 def key_figures(summary: dict[str, Any]) -> list[str]:

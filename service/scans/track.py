@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -15,22 +15,6 @@ from service.cameras.camera_file import shutter_of
 from service.errors import InputError
 from service.georeference import LocalFrame, vertical_code
 from service.stream.records import PoseRecord, ScanHeader
-
-CSV_COLUMNS = (
-    "time_unix_s",
-    "lat_deg",
-    "lon_deg",
-    "alt_amsl_m",
-    "agl_m",
-    "roll_deg",
-    "pitch_deg",
-    "yaw_deg",
-    "speed_m_s",
-    "distance_m",
-    "turn_rate_deg_s",
-    "sources",
-    "sigma_m",
-)
 
 
 def local_frame(header: ScanHeader) -> LocalFrame | None:
@@ -93,26 +77,26 @@ def seconds_text(time_unix_ns: int) -> str:
 
 def csv_table(poses: Sequence[PoseRecord]) -> str:
     """The trajectory as a table; unknown values are empty."""
+    distances_m = iter(flown_m(poses))
+    columns: dict[str, Callable[[PoseRecord], str]] = {
+        "time_unix_s": lambda p: seconds_text(p.time_unix_ns),
+        "lat_deg": lambda p: cell(p.lat_deg, 9),
+        "lon_deg": lambda p: cell(p.lon_deg, 9),
+        "alt_amsl_m": lambda p: cell(p.alt_amsl_m, 3),
+        "agl_m": lambda p: cell(p.agl_m, 3),
+        "roll_deg": lambda p: cell(math.degrees(p.roll_rad), 4),
+        "pitch_deg": lambda p: cell(math.degrees(p.pitch_rad), 4),
+        "yaw_deg": lambda p: cell(math.degrees(p.yaw_rad), 4),
+        "speed_m_s": lambda p: cell(p.speed_m_s, 3),
+        "distance_m": lambda _: cell(next(distances_m), 3),
+        "turn_rate_deg_s": lambda p: cell(math.degrees(p.turn_rate_rad_s), 3),
+        "sources": lambda p: "+".join(p.sources),
+        "sigma_m": lambda p: cell(p.sigma_m, 4),
+    }
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
-    table.writerow(CSV_COLUMNS)
-    for p, distance_m in zip(poses, flown_m(poses), strict=True):
-        angles = (p.roll_rad, p.pitch_rad, p.yaw_rad)
-        table.writerow(
-            [
-                seconds_text(p.time_unix_ns),
-                cell(p.lat_deg, 9),
-                cell(p.lon_deg, 9),
-                cell(p.alt_amsl_m, 3),
-                cell(p.agl_m, 3),
-                *(cell(math.degrees(a), 4) for a in angles),
-                cell(p.speed_m_s, 3),
-                cell(distance_m, 3),
-                cell(math.degrees(p.turn_rate_rad_s), 3),
-                "+".join(p.sources),
-                cell(p.sigma_m, 4),
-            ]
-        )
+    table.writerow(columns)
+    table.writerows([text(p) for text in columns.values()] for p in poses)
     return out.getvalue()
 
 

@@ -40,7 +40,7 @@ from service.offline.exports.maps import write_kinds
 from service.offline.exports.rasters import NODATA_M, open_map
 from service.offline.exports.splats import read_splats
 from service.offline.exports.view import ExportOptions, ScanView
-from service.offline.view_scoring import by_gaussians, by_rays, read_glb, score_views
+from service.offline.view_scoring import by_gaussians, by_rays, frame_scores, means, read_glb
 from service.scans.folder import Failures
 from service.sim.truth import Truth, heights_below, read_truth
 
@@ -345,7 +345,7 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
     page.parts.append(f"<h2>{name}: frames that took no part</h2>")
     video = flight / "flight.mp4"
     try:
-        scores = score_views(scan, video if video.is_file() else flight, every=EVERY)
+        scores = means(frame_scores(scan, video if video.is_file() else flight, every=EVERY))
     except InputError as error:  # all frames are keyframes
         page.parts.append(f"<p>{html.escape(str(error))}</p>")
         return

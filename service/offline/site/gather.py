@@ -7,7 +7,6 @@ number, so whatever works on a scan works on a site. The scans themselves are on
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -18,7 +17,6 @@ import numpy as np
 
 from recon import se3
 from recon.similarity import Similarity
-from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame, between_frames
 from service.offline.refine.revisions import finished_store
@@ -27,7 +25,7 @@ from service.offline.site.start import Pair, placing
 from service.scans.main_piece import main_seqs
 from service.scans.track import local_frame
 from service.stream import codec
-from service.stream.records import PoseRecord, Repose, ScanHeader
+from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
 from service.version import software
 
@@ -200,15 +198,12 @@ def _copy_poses(
     if any(after[0] <= before[1] for before, after in pairwise(ends)):
         return
     for track, k in tracks:
-        placed = (placed_pose(p, members[k].move.pose(p.T_world_camera), origin) for p in track)
-        site.add_poses(list(placed))
-
-
-def placed_pose(pose: PoseRecord, T: F64, origin: LocalFrame) -> PoseRecord:
-    """The record at another pose, with its geographic position."""
-    lat, lon, alt = origin.place(T[:3, 3])
-    good = all(math.isfinite(v) for v in (lat, lon, alt))
-    return replace(
-        pose, T_world_camera=T, lat_deg=lat if good else None, lon_deg=lon if good else None,
-        alt_amsl_m=alt if good else None,
-    )  # fmt: skip
+        placed = []
+        for pose in track:
+            T = members[k].move.pose(pose.T_world_camera)
+            geodetic: Sequence[float | None] = origin.place(T[:3, 3])
+            if not np.isfinite(np.array(geodetic)).all():
+                geodetic = None, None, None
+            lat, lon, alt = geodetic
+            placed.append(replace(pose, T_world_camera=T, lat_deg=lat, lon_deg=lon, alt_amsl_m=alt))
+        site.add_poses(placed)

@@ -22,7 +22,14 @@ from recon.types import F64, U8, Bool, Camera, Keyframe
 from service.cli import app
 from service.errors import InputError
 from service.offline.exports.view import ScanView
-from service.offline.view_scoring import by_rays, depth_grids, looks_inside, placed, score_views
+from service.offline.view_scoring import (
+    by_rays,
+    depth_grids,
+    frame_scores,
+    looks_inside,
+    means,
+    placed,
+)
 from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
 from service.stream.codec import encode
@@ -103,7 +110,7 @@ def test_products_are_compared_on_the_pixels_that_the_depth_images_cover(
             drawn[~covered] = (255, 0, 0)
             return drawn, np.ones_like(covered)
 
-        found = score_views(scan, tmp_path / "stills", others={"over blue": over_blue})
+        found = means(frame_scores(scan, tmp_path / "stills", others={"over blue": over_blue}))
     assert found["over blue"]["psnr_db"] < found["surface"]["psnr_db"] - 1.0
     assert found["over blue"]["psnr_on_grids_db"] == found["surface"]["psnr_on_grids_db"]
 
