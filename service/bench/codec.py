@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -33,28 +34,26 @@ def run(options: BenchOptions) -> list[BenchResult]:
     last_layer = codec.encode(whole, 0)[-1:]
     encode = "encode 320x180, both layers, one core"
     laz = partial(encode_laz, *points(whole))
-    return [
-        on_one_core(encode, partial(codec.encode, whole, 0), options, LAZ, laz),
-        on_one_core(
-            "encode its fresh part at 80 % overlap", partial(codec.encode, part, 0), options
-        ),
-        on_one_core("decode a whole keyframe", partial(codec.decode, last_layer), options),
-    ]
+    fresh = "encode its fresh part at 80 % overlap"
+    with one_core():
+        return [
+            by_thread(encode, partial(codec.encode, whole, 0), options, LAZ, laz),
+            by_thread(fresh, partial(codec.encode, part, 0), options),
+            by_thread("decode a whole keyframe", partial(codec.decode, last_layer), options),
+        ]
 
 
-def on_one_core(
-    what: str,
-    ours: Callable[[], object],
-    options: BenchOptions,
-    peer: str = "",
-    theirs: Callable[[], object] | None = None,
-) -> BenchResult:
-    """As :func:`compare`, by the processor time of this thread, so a busy machine counts less;
-    OpenCV has no threads of its own."""
+by_thread = partial(compare, clock=time.thread_time)
+"""By the processor time of this thread, so a busy machine counts less."""
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """OpenCV without threads of its own."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return compare(what, ours, options, peer, theirs, clock=time.thread_time)
+        yield
     finally:
         cv2.setNumThreads(threads)
 

@@ -57,7 +57,6 @@ from service.scans.annotations import (
     Point,
     Spot,
     add_annotation,
-    as_json,
     delete_annotation,
     read_annotations,
 )
@@ -276,7 +275,7 @@ def _delete(request: Request) -> Response:
 
 def _annotations(request: Request) -> Response:
     """The annotations of a scan as GeoJSON."""
-    return JSONResponse(as_json(read_annotations(folder_of(request))))
+    return JSONResponse(msgspec.to_builtins(read_annotations(folder_of(request))))
 
 
 @changing("annotate", NewAnnotation)
@@ -289,7 +288,7 @@ def _annotate(request: Request, new: NewAnnotation) -> Response:
     by = str(request.scope[WHO]).partition(".")[0]
     with state_of(request).library.changing(*names_of(request)) as folder:
         made = add_annotation(folder, geometry, new.text, by, time.time())
-    return JSONResponse(as_json(made), 201)
+    return JSONResponse(msgspec.to_builtins(made), 201)
 
 
 @changing("erase annotation")

@@ -245,7 +245,7 @@ def contour_mask(height_m: F32, step_m: float) -> np.ndarray:
 def coverage_image(found: Coverage, tile: Tile) -> U8:
     if found.frame is None:
         raise MissingError("no map: the scan has no georeference")
-    west, south, east, north = found.bounds_m
+    west, south, east, north = found.layer.grid.bounds
     corners = np.array([[west, north, 0.0], [east, north, 0.0], [west, south, 0.0]])
     scale = float(SIDE << tile[0])
     on_tile = on_map(found.frame, corners)[:, :2] * scale - np.array(tile[1:]) * SIDE - 0.5

@@ -4,7 +4,7 @@ folder."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -116,7 +116,3 @@ def _text(text: str) -> str:
 
 def _write(folder: Path, known: Annotations) -> None:
     write_whole(folder / ANNOTATIONS, msgspec.json.encode(known))
-
-
-def as_json(document: Annotation | Annotations) -> Any:
-    return msgspec.to_builtins(document)

@@ -58,16 +58,11 @@ class Coverage:
         """(rows, cols) bool: cells worth another flight."""
         return self.layer.weak(self.min_views, self.max_sigma_m)
 
-    @property
-    def bounds_m(self) -> tuple[float, float, float, float]:
-        """(west, south, east, north) in ENU metres of the scan's origin."""
-        return self.layer.grid.bounds
-
     def corners_lat_lon(self) -> list[tuple[float, float]] | None:
         """(latitude, longitude) of the image's NW, NE, SE and SW corners, if georeferenced."""
         if self.frame is None:
             return None
-        west, south, east, north = self.bounds_m
+        west, south, east, north = self.layer.grid.bounds
         enu = np.array([[west, north, 0], [east, north, 0], [east, south, 0], [west, south, 0]])
         rows = self.frame.to_geodetic(enu.astype(np.float64))
         return [(round(float(r[0]), 8), round(float(r[1]), 8)) for r in rows]
@@ -79,7 +74,7 @@ class Coverage:
         some = bool(known.any())
         return {
             "cell_m": layer.grid.cell_m,
-            "bounds_m": [round(v, 3) for v in self.bounds_m],
+            "bounds_m": [round(v, 3) for v in layer.grid.bounds],
             "corners_lat_lon": self.corners_lat_lon(),
             "keyframes": len(self.places),
             "measured_m2": round(float(known.sum()) * area, 1),

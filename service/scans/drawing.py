@@ -82,8 +82,7 @@ def draw_maps(
     scale = _scale(raster.grid.shape, largest_px)
     for panel in (colour, height):
         _draw_track(panel, raster.grid, track_m, scale)
-        _draw_scale_bar(panel, raster.grid.cell_m / scale)
-        _draw_north(panel)
+        _draw_scale_and_north(panel, raster.grid.cell_m / scale)
     _draw_height_legend(height, [end + height_of_zero_m for end in ends])
     return Maps(colour, height, raster.grid.cell_m)
 
@@ -239,23 +238,17 @@ def round_length(most: float) -> float:
     return max(m * power for m in (1.0, 2.0, 5.0) if m * power <= most * (1.0 + 1e-12))
 
 
-def _draw_scale_bar(panel: U8, metres_per_px: float) -> None:
+def _draw_scale_and_north(panel: U8, metres_per_px: float) -> None:
     length_m = round_length(panel.shape[1] * metres_per_px / 5.0)
     length_px = round(length_m / metres_per_px)
     grown = _growth(panel)
-    x, y = round(12 * grown), panel.shape[0] - round(14 * grown)
-    for colour, thick in ((BACKGROUND, 5), (INK, 2)):
-        cv2.line(panel, (x, y), (x + length_px, y), colour, round(thick * grown), cv2.LINE_AA)
-    _text(panel, f"{length_m:g} m", (x, y - round(8 * grown)), 0.45 * grown)
-
-
-def _draw_north(panel: U8) -> None:
-    grown = _growth(panel)
-    right, top, foot, word = (round(v * grown) for v in (20, 14, 40, 56))
-    x = panel.shape[1] - right
-    for colour, thick in ((BACKGROUND, 5), (INK, 2)):
-        ends = (x, foot), (x, top)
-        cv2.arrowedLine(panel, *ends, colour, round(thick * grown), cv2.LINE_AA, tipLength=0.35)
+    left, above, right, top, foot, word = (round(v * grown) for v in (12, 14, 20, 14, 40, 56))
+    y, x = panel.shape[0] - above, panel.shape[1] - right
+    for colour, size in ((BACKGROUND, 5), (INK, 2)):
+        thick = round(size * grown)
+        cv2.line(panel, (left, y), (left + length_px, y), colour, thick, cv2.LINE_AA)
+        cv2.arrowedLine(panel, (x, foot), (x, top), colour, thick, cv2.LINE_AA, tipLength=0.35)
+    _text(panel, f"{length_m:g} m", (left, y - round(8 * grown)), 0.45 * grown)
     _text(panel, "N", (x - round(5 * grown), word), 0.45 * grown)
 
 

@@ -274,10 +274,9 @@ class _Files:
             )
         if self._raster is not None:
             with self.failures.noted(THUMBNAIL):
-                bounds = (
-                    self._raster.grid.bounds if self._coverage is None else self._coverage.bounds_m
-                )
-                self._write_image(THUMBNAIL, drawing.draw_thumbnail(self._raster, bounds), WEBP)
+                grid = self._raster.grid if self._coverage is None else self._coverage.layer.grid
+                image = drawing.draw_thumbnail(self._raster, grid.bounds)
+                self._write_image(THUMBNAIL, image, WEBP)
         with self.failures.noted(REPORT):
             shown = middle_stages(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage

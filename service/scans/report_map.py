@@ -54,7 +54,7 @@ def _view(poses: Sequence[PoseRecord], coverage: Coverage | None) -> Grid:
     """The map's pixels, as cells of the ground."""
     spots = [p.T_world_camera[:2, 3] for p in poses]
     if coverage is not None:
-        west, south, east, north = coverage.bounds_m
+        west, south, east, north = coverage.layer.grid.bounds
         spots += [np.array([west, south]), np.array([east, north])]
     low, high = np.min(spots, axis=0), np.max(spots, axis=0)
     margin = 0.02 * float(np.max(high - low)) + 1.0
@@ -70,7 +70,7 @@ def _px(view: Grid, xy_m: F64) -> F64:
 
 
 def _ground(coverage: Coverage, view: Grid) -> str:
-    west, south, east, north = coverage.bounds_m
+    west, south, east, north = coverage.layer.grid.bounds
     (x, y), (x1, y1) = _px(view, np.array([[west, north], [east, south]]))
     code = base64.b64encode(coverage.png_bytes()).decode("ascii")
     return (

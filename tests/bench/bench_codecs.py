@@ -16,7 +16,7 @@ import numpy as np
 
 from recon.types import F32, U8, Keyframe
 from service.bench import BenchOptions, BenchResult
-from service.bench.codec import LAZ, SIZE_PX, encode_laz, on_one_core, points
+from service.bench.codec import LAZ, SIZE_PX, by_thread, encode_laz, one_core, points
 from service.bench.keyframes import make_keyframe, strip
 from service.stream import codec
 
@@ -65,7 +65,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
 
 def _figures(coded: list[Coded]) -> tuple[float, float, float, float]:
     """Bits per point, milliseconds to encode, centimetres at 60 m, dB PSNR."""
-    encode_ms = [on_one_core("", one.encode, BenchOptions()).value for one in coded]
+    with one_core():
+        encode_ms = [by_thread("", one.encode, BenchOptions()).value for one in coded]
     bits = [8 * len(one.encode()) / one.points for one in coded]
     rms, psnr = np.array([one[2:] for one in coded]).T
     return (

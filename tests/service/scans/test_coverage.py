@@ -237,7 +237,7 @@ def test_a_live_layer_follows_new_keyframes_and_corrections(
         second, fresh = live.refresh(), coverage_of(store)
     assert first is not None and second is not None and fresh is not None
     assert second.figures() == fresh.figures()
-    assert second.bounds_m[2] > first.bounds_m[2] + 30.0
+    assert second.layer.grid.bounds[2] > first.layer.grid.bounds[2] + 30.0
     assert np.array_equal(second.layer.views, fresh.layer.views)
 
 
