@@ -153,14 +153,23 @@ class Upload:
             raise InputError(OWN_PATH.sub("", str(error))) from error
 
     def replay(self) -> Callable[[Progress], str]:
-        """Work that makes a scan of the recording and imports it; it owns the files from now on."""
+        """Work that makes a scan of the recording and imports it; it owns the files from now on.
+        It raises InputError with the process's last line when that fails."""
         files, self._files = self._files.pop_all(), contextlib.ExitStack()
-        library, place, paths = self._library, self._place, self._paths
+        library, folder = self._library, self._place / "replayed"
+        of = {PARTS[path.suffix]: path for path in self._paths}
+        command = python_command("service.cli", "replay", str(of.pop("video")))
+        command += [word for option, path in of.items() for word in (option, str(path))]
 
         def work(progress: Progress) -> str:
+            def goes_on(line: str) -> bool:
+                follow(progress, line)
+                return True
+
             with files:
-                folder = place / "replayed"
-                _replay(paths, folder, progress)
+                fault = run_to_end("replay", [*command, "--out", str(folder)], goes_on)
+                if fault:
+                    raise InputError(OWN_PATH.sub("", fault))
                 progress.commit("importing")
                 return "/".join(library.take(folder))
 
@@ -170,22 +179,6 @@ class Upload:
         """Delete the files, and let other imports run."""
         with self._opened:
             self._files.close()
-
-
-def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
-    """Make the scan folder ``out`` of a video and perhaps a log and a camera model. Raises
-    InputError with the process's last line when it fails."""
-    of = {PARTS[path.suffix]: path for path in paths}
-    command = python_command("service.cli", "replay", str(of.pop("video")))
-    command += [word for option, path in of.items() for word in (option, str(path))]
-
-    def goes_on(line: str) -> bool:
-        follow(progress, line)
-        return True
-
-    fault = run_to_end("replay", [*command, "--out", str(out)], goes_on)
-    if fault:
-        raise InputError(OWN_PATH.sub("", fault))
 
 
 def follow(progress: Progress, line: str) -> None:

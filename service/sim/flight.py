@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -235,25 +235,17 @@ class SensorNoise:
         check_ranges(*((name, getattr(self, name), "", 0, 1000) for name in self.__slots__))
 
 
-@dataclass(slots=True, eq=False)
 class Sensors:
     """Noisy measurements of a flight; wandering errors are shared by all sensors they touch."""
 
-    flight: Flight
-    noise: SensorNoise
-    rng: np.random.Generator
-    _t: F64 = field(init=False)
-    _drift: F64 = field(init=False)  # (T, 7) east, north, up, baro, roll, pitch, yaw
-
-    def __post_init__(self) -> None:
-        n, plan = self.noise, self.flight.plan
-        span = np.arange(-LEAD_S - 1.0, plan.duration_s + LEAD_S + 1.0, 0.1)
-        self._t = np.asarray(span, np.float64)
-        sigma = [n.gps_m, n.gps_m, 1.5 * n.gps_m, n.baro_m]
-        sigma += list(np.radians([n.attitude_deg, n.attitude_deg, n.yaw_deg]))
+    def __init__(self, flight: Flight, noise: SensorNoise, rng: np.random.Generator) -> None:
+        self.flight, self.noise, self.rng = flight, noise, rng
+        self._t = np.arange(-LEAD_S - 1.0, flight.plan.duration_s + LEAD_S + 1.0, 0.1)
+        sigma = [noise.gps_m, noise.gps_m, 1.5 * noise.gps_m, noise.baro_m]
+        sigma += list(np.radians([noise.attitude_deg, noise.attitude_deg, noise.yaw_deg]))
         tau_s = np.array([60.0, 60.0, 60.0, 120.0, 25.0, 25.0, 40.0])
         keep = np.exp(-0.1 / tau_s)  # first-order Gauss-Markov
-        walk = self.rng.normal(size=(len(self._t), 7))
+        walk = rng.normal(size=(len(self._t), 7))  # east, north, up, baro, roll, pitch, yaw
         for k in range(1, len(walk)):
             walk[k] = keep * walk[k - 1] + np.sqrt(1 - keep**2) * walk[k]
         self._drift = gaussian_filter1d(walk * sigma, 5.0, axis=0, mode="nearest")

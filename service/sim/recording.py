@@ -24,7 +24,7 @@ from service.sim.flight import Flight, FlightPlan, SensorNoise, Sensors, check_r
 from service.sim.ground_texture import patchwork
 from service.sim.render import Look, Renderer
 from service.sim.scene import Area
-from service.sim.telemetry import TelemetryOptions, packets, write_tlog
+from service.sim.telemetry import FlightMessages, TelemetryOptions
 from service.sim.truth import write_surface
 
 EPOCH_UNIX_S = 1_777_629_600  # 2026-05-01 10:00:00 UTC: containers keep whole seconds
@@ -240,11 +240,11 @@ def write(
     save_camera(folder / "camera.yaml", options.camera, "simulated")
     packet_count = 0
     if options.with_telemetry:
-        stream = packets(
+        messages = FlightMessages(
             simulation.sensors(), ORIGIN, options.started_unix_s, simulation.surface_range,
             options.telemetry,
         )  # fmt: skip
-        packet_count = write_tlog(folder / "flight.tlog", options.started_unix_s, stream)
+        packet_count = messages.write_tlog(folder / "flight.tlog")
     _write_truth(simulation, truth)
     parameters = _parameters(simulation, packet_count)
     (truth / "params.json").write_text(json.dumps(parameters, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""The flight's MAVLink messages: as a tlog, or packet by packet in real time."""
+"""The flight's MAVLink messages, as a tlog."""
 
 from __future__ import annotations
 
@@ -50,47 +50,12 @@ class TelemetryOptions:
             raise ValueError(f"gimbal frame {self.gimbal_frame!r} is not 'earth' or 'vehicle'")
 
 
-def packets(
-    sensors: Sensors,
-    origin: LocalFrame,
-    epoch_unix_s: float,
-    ground_range: RANGE_TO_GROUND,
-    options: TelemetryOptions,
-) -> Iterator[tuple[float, bytes]]:
-    """(seconds since the first frame, MAVLink 2 packet) in the order of time."""
-    messages = _SimulatedMessages(sensors, origin, epoch_unix_s, ground_range, options)
-    kinds = [
-        messages.housekeeping(), messages.attitude(), messages.gimbal(), messages.position(),
-        messages.satellites(), *([messages.range()] if options.rangefinder else []),
-    ]  # fmt: skip
-    packer = Packer(0)
-    for message, component, t in heapq.merge(*kinds, key=lambda item: item[2]):
-        if t < -options.lead_s:  # a video piped without its time is taken to begin with the log
-            continue
-        if options.gap_s and options.gap_s[0] <= t < options.gap_s[1]:
-            continue
-        data = packer.pack(1, OutgoingMessage(component, message), 0)
-        if data is not None:
-            yield t, data
-
-
-def write_tlog(path: Path, epoch_unix_s: float, stream: Iterator[tuple[float, bytes]]) -> int:
-    """Write packets as a tlog and return their number: big-endian unix microseconds before each."""
-    count = 0
-    with path.open("wb") as out:
-        for t, data in stream:
-            out.write(struct.pack(">Q", round((epoch_unix_s + t) * 1e6)))
-            out.write(data)
-            count += 1
-    return count
-
-
 def _boot_ms(t: F64) -> npt.NDArray[np.int64]:
     return np.asarray(np.round((t + BOOT_BEFORE_VIDEO_S) * 1e3), np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _SimulatedMessages:
+class FlightMessages:
     """The messages of a flight kind by kind, each kind in the order of time."""
 
     sensors: Sensors
@@ -98,6 +63,25 @@ class _SimulatedMessages:
     epoch_unix_s: float
     ground_range: RANGE_TO_GROUND
     options: TelemetryOptions
+
+    def write_tlog(self, path: Path) -> int:
+        """Write MAVLink 2 packets as a tlog, big-endian unix microseconds before each; how many."""
+        kinds = [
+            self.housekeeping(), self.attitude(), self.gimbal(), self.position(),
+            self.satellites(), *([self.range()] if self.options.rangefinder else []),
+        ]  # fmt: skip
+        gap = self.options.gap_s
+        packer, count = Packer(0), 0
+        with path.open("wb") as out:
+            for message, component, t in heapq.merge(*kinds, key=lambda item: item[2]):
+                # a video piped without its time is taken to begin with the log
+                if t < -self.options.lead_s or (gap and gap[0] <= t < gap[1]):
+                    continue
+                data = packer.pack(1, OutgoingMessage(component, message), 0)
+                if data is not None:
+                    out.write(struct.pack(">Q", round((self.epoch_unix_s + t) * 1e6)) + data)
+                    count += 1
+        return count
 
     def _times(self, hz: float) -> F64:
         """From before the first frame until after the last."""

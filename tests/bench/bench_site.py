@@ -35,7 +35,7 @@ from service.sim.recording import (
     prepare,
     write,
 )
-from service.sim.telemetry import packets, write_tlog
+from service.sim.telemetry import FlightMessages
 from service.sim.truth import Truth, read_truth
 from service.stream.store import ScanStore
 
@@ -106,10 +106,11 @@ def _replayed(
     sensors = Sensors(
         simulation.flight, simulation.options.noise, np.random.default_rng([seed, *name.encode()])
     )
-    start = simulation.options.started_unix_s
-    stream = packets(sensors, ORIGIN, start, simulation.surface_range, simulation.options.telemetry)
     log = folder / f"{name}-{seed}.tlog"
-    write_tlog(log, start, stream)
+    FlightMessages(
+        sensors, ORIGIN, simulation.options.started_unix_s, simulation.surface_range,
+        simulation.options.telemetry,
+    ).write_tlog(log)  # fmt: skip
     skyrelief(
         "replay", str(folder / name / "flight.mp4"), "--telemetry", str(log), "--camera-model",
         str(folder / name / "camera.yaml"), "--out", str(out), "--backend", options.backend,
