@@ -25,6 +25,7 @@ import numpy as np
 from numba import njit
 
 from recon import se3
+from recon.camera_model import project, rays
 from recon.small_matrices import invert_3x3, solve_symmetric
 from recon.types import F64, I64, Bool
 
@@ -83,7 +84,7 @@ def compose(A: F64, B: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _cost(T: F64, X: F64, cam: I64, pt: I64, uv: F64, k: F64, huber: float, res: F64) -> float:
+def cost_of(T: F64, X: F64, cam: I64, pt: I64, uv: F64, k: F64, huber: float, res: F64) -> float:
     """Huber cost of all observations; ``res`` (M,) receives the error lengths in pixels."""
     total = 0.0
     for m in range(cam.size):
@@ -222,7 +223,7 @@ def _adjust(
     res = np.zeros(M)
     step = np.zeros((4, 4))
     dc = np.zeros((6 * n_free, 1))
-    cost = _cost(T, X, cam, pt, uv, k, huber, res)
+    cost = cost_of(T, X, cam, pt, uv, k, huber, res)
     damping = 1e-4
     for _ in range(iterations):
         _normal_equations(
@@ -249,7 +250,7 @@ def _adjust(
             for i in range(3):
                 for j in range(3):
                     X_new[p, i] += Hpp_inv[p, i, j] * bp[p, j]
-        cost_new = _cost(T_new, X_new, cam, pt, uv, k, huber, res)
+        cost_new = cost_of(T_new, X_new, cam, pt, uv, k, huber, res)
         if cost_new < cost:
             gain = (cost - cost_new) / max(cost, 1e-12)
             T, X, cost = T_new, X_new, cost_new
@@ -260,7 +261,7 @@ def _adjust(
             damping *= 10.0
             if damping > 1e4:
                 break
-    _cost(T, X, cam, pt, uv, k, huber, res)
+    cost_of(T, X, cam, pt, uv, k, huber, res)
     runs, sides = np.zeros((first.size - 1, g.size, g.size)), np.zeros((first.size - 1, g.size))
     for c in range(first.size - 1):
         a, b = first[c], first[c + 1]
@@ -354,18 +355,24 @@ def noise(inverse: F64, cells: F64, sides: F64) -> float:
     return float(squares / (len(inverse) - np.einsum("cij,cji->", leverage, leverage)))
 
 
-def triangulate(T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64) -> tuple[F64, F64]:
-    """(N, 3) world points between two rays each, and (N,) parallax angles in rad.
+def reprojection_error(T_camera_world: F64, points_m: F64, K: F64, uv_px: F64) -> F64:
+    """(N,) distance in pixels; inf for points behind the camera or NaN."""
+    error = np.linalg.norm(project(K, se3.transform(T_camera_world, points_m)) - uv_px, axis=1)
+    return np.asarray(np.where(np.isfinite(error), error, np.inf))
+
+
+def triangulate(
+    T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64
+) -> tuple[F64, F64, F64]:
+    """(N, 3) world points between two rays each, (N,) parallax angles in rad, and the larger (N,)
+    of their two reprojection errors in px.
 
     Midpoint of the shortest segment between the rays (T_x_world are camera-from-world).
     Points behind a camera come back as NaN.
     """
     centre_a = -T_a_world[:3, :3].T @ T_a_world[:3, 3]
     centre_b = -T_b_world[:3, :3].T @ T_b_world[:3, 3]
-    K_inv = np.linalg.inv(K)
-    one = np.ones((uv_a.shape[0], 1))
-    da = np.hstack([uv_a, one]) @ K_inv.T @ T_a_world[:3, :3]
-    db = np.hstack([uv_b, one]) @ K_inv.T @ T_b_world[:3, :3]
+    da, db = rays(K, uv_a) @ T_a_world[:3, :3], rays(K, uv_b) @ T_b_world[:3, :3]
     da /= np.linalg.norm(da, axis=1, keepdims=True)
     db /= np.linalg.norm(db, axis=1, keepdims=True)
     w = centre_b - centre_a
@@ -376,4 +383,8 @@ def triangulate(T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64) ->
     sb = (ab * aw - bw) / den
     points = 0.5 * (centre_a + sa[:, None] * da + centre_b + sb[:, None] * db)
     points[(sa <= 0) | (sb <= 0)] = np.nan
-    return points, np.arctan2(np.linalg.norm(np.cross(da, db), axis=1), ab)
+    error = np.maximum(
+        reprojection_error(T_a_world, points, K, uv_a),
+        reprojection_error(T_b_world, points, K, uv_b),
+    )
+    return points, np.arctan2(np.linalg.norm(np.cross(da, db), axis=1), ab), error

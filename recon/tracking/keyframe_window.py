@@ -8,7 +8,7 @@ import numpy as np
 
 from recon import se3
 from recon.rolling_shutter import FrameRows
-from recon.tracking import bundle, two_view
+from recon.tracking import bundle
 from recon.tracking.frame import Frame
 from recon.types import F64, I64, Bool
 
@@ -47,11 +47,7 @@ def triangulate(
     far = np.full(rows.size, np.nan_to_num(1.0 / median_depth(key)))
     uv_a = key.row_motion.at_middle(K, key.uv[rows], far)
     uv_b = row_motion.at_middle(K, uv[rows], far)
-    points, angle = bundle.triangulate(key.T_camera_odom, T_camera_odom, K, uv_a, uv_b)
-    error = np.maximum(
-        two_view.reprojection_error(key.T_camera_odom, points, K, uv_a),
-        two_view.reprojection_error(T_camera_odom, points, K, uv_b),
-    )
+    points, angle, error = bundle.triangulate(key.T_camera_odom, T_camera_odom, K, uv_a, uv_b)
     gate_px = max(1.5, 2.0 * float(np.median(error)))
     good = (error < min(gate_px, loose_px)) & (angle > min_parallax_rad)
     key.landmark[rows[good]] = key.landmarks.add(points[good])

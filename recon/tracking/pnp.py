@@ -17,7 +17,7 @@ from numba import njit
 from recon import se3
 from recon.small_matrices import solve_symmetric
 from recon.tracking import robust_geometry
-from recon.tracking.bundle import compose, linearise, se3_exp
+from recon.tracking.bundle import compose, cost_of, linearise, se3_exp
 from recon.types import F64, Bool
 
 THRESHOLD_PX = 2.0
@@ -99,17 +99,10 @@ def _starts(
     return [T for T in (prior, drawn) if T is not None]
 
 
-@njit(cache=True, nogil=True)
-def _errors(T: F64, points: F64, uv: F64, k: F64) -> F64:  # pragma: no cover - compiled
+def _errors(T: F64, points: F64, uv: F64, k: F64) -> F64:
     """(N,) reprojection errors in px; infinite behind the camera."""
-    error = np.full(len(points), np.inf)
-    for m in range(len(points)):
-        x = points[m]
-        z = T[2, 0] * x[0] + T[2, 1] * x[1] + T[2, 2] * x[2] + T[2, 3]
-        if z > 1e-6:
-            u = k[0] * (T[0, 0] * x[0] + T[0, 1] * x[1] + T[0, 2] * x[2] + T[0, 3]) / z + k[2]
-            v = k[1] * (T[1, 0] * x[0] + T[1, 1] * x[1] + T[1, 2] * x[2] + T[1, 3]) / z + k[3]
-            error[m] = np.hypot(u - uv[m, 0], v - uv[m, 1])
+    error, each = np.empty(len(points)), np.arange(len(points))
+    cost_of(T[None], points, np.zeros_like(each), each, uv, k, np.inf, error)
     return error
 
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
 from recon import se3
 from recon.camera_model import rays
-from recon.small_matrices import solve_symmetric
 from recon.tracking import robust_geometry, two_view
 from recon.tracking.frame import Frame
 from recon.types import F64, I64, Bool, PosePrior
@@ -20,34 +18,13 @@ def inverse_depth_plane(P: F64) -> F64:
     """(3,) q with ``1 / z = q . ray`` for the plane through camera points (N, 3)."""
     if len(P) < 3:
         return np.array([0.0, 0.0, 1.0 / max(float(np.median(P[:, 2])) if len(P) else 1.0, 1e-6)])
-    return np.asarray(_robust_plane(np.ascontiguousarray(P, np.float64)))
-
-
-@njit(cache=True, nogil=True)
-def _robust_plane(P: F64) -> F64:  # pragma: no cover - compiled
-    """Iteratively reweighted least squares of the inverse depths."""
-    N = len(P)
-    q, error, row, H = np.zeros((3, 1)), np.empty(N), np.empty(3), np.empty((3, 3))
-    scale = np.inf
+    inverse = 1.0 / P[:, 2]
+    at, weight = P * inverse[:, None], np.ones(len(P))
     for _ in range(5):
-        H[:, :] = 0.0
-        q[:, 0] = 0.0
-        for m in range(N):
-            w = 1.0 / P[m, 2]
-            row[0], row[1], row[2] = P[m, 0] * w, P[m, 1] * w, 1.0
-            weight = 1.0 / (1.0 + (error[m] / (2 * scale)) ** 2) if scale < np.inf else 1.0
-            for i in range(3):
-                q[i, 0] += weight * row[i] * w
-                for j in range(3):
-                    H[i, j] += weight * row[i] * row[j]
-        for i in range(3):
-            H[i, i] += 1e-9
-        solve_symmetric(H, q)
-        for m in range(N):
-            w = 1.0 / P[m, 2]
-            error[m] = abs(w * (P[m, 0] * q[0, 0] + P[m, 1] * q[1, 0] - 1.0) + q[2, 0])
-        scale = max(1.4826 * np.median(error), 1e-9)
-    return q[:, 0]
+        weighted = at * weight[:, None]
+        q = np.linalg.solve(weighted.T @ at + 1e-9 * np.eye(3), weighted.T @ inverse)
+        weight = robust_geometry.cauchy_weights(np.abs(at @ q - inverse))
+    return np.asarray(q)
 
 
 def on_landmarks(
@@ -120,11 +97,11 @@ def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
 def beyond_turn(uv_a: F64, uv_b: F64, K: F64) -> float:
     """Median angle in rad that the best turn of the camera leaves between matches (N, 2)."""
     a, b = (ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (rays(K, uv_a), rays(K, uv_b)))
-    weight, off = np.ones(len(a)), np.zeros(len(a))
+    weight = np.ones(len(a))
     for _ in range(5):
         R_b_a = se3.nearest_rotation((b * weight[:, None]).T @ a)
         off = np.linalg.norm(b - a @ R_b_a.T, axis=1)
-        weight = 1.0 / (1.0 + (off / (2.0 * max(float(np.median(off)), 1e-9))) ** 2)
+        weight = robust_geometry.cauchy_weights(off)
     return float(np.median(off))
 
 

@@ -8,7 +8,6 @@ neighbouring frames, which a wrong readout bends, so the search repeats from win
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 
 import numpy as np
 
@@ -35,18 +34,13 @@ GLOBAL_S = 5e-4  # a readout and a sigma below it show a global shutter
 USUAL_S = 0.02  # sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms
 
 
-Cost = Callable[["list[Frame]", float, F64], tuple[float, int]]
-"""(Keyframes, readout in s, K) to :func:`window_cost`."""
-
-
 class ReadoutSearch:
     """Looks at keyframes as they settle, and sets the clock of their rows. ``readout_s`` is
     negative against the shutter's direction; ``windows`` of keyframes show it, 0 until one does."""
 
-    def __init__(self, clock: RowClock, K: F64, cost: Cost | None = None) -> None:
-        """``cost`` says how well a window fits a readout; by default :func:`window_cost`."""
+    def __init__(self, clock: RowClock, K: F64) -> None:
         self.readout_s, self.sigma_s, self.windows = 0.0, USUAL_S, 0
-        self._clock, self._K, self._cost = clock, K, cost or window_cost
+        self._clock, self._K = clock, K
         self._last_seq = -1
         self._found: deque[tuple[float, float]] = deque(maxlen=4)  # readout, weight
 
@@ -89,7 +83,7 @@ class ReadoutSearch:
     def _take(self, window: list[Frame]) -> None:
         now = self._clock.readout_s
         tried = now + STEP_S * np.arange(-1.0, 2.0) if self.is_sure else COARSE_S
-        costs = [self._cost(window, float(readout_s), self._K) for readout_s in tried]
+        costs = [window_cost(window, float(readout_s), self._K) for readout_s in tried]
         k = int(np.clip(np.argmin([cost for cost, _ in costs]), 1, len(tried) - 2))
         (below, _), (here, redundancy), (above, _) = costs[k - 1 : k + 2]
         spacing = tried[1] - tried[0]

@@ -55,6 +55,12 @@ def _spans_a_plane(points: F64) -> bool:
     return bool(across > max(MIN_SPREAD[points.shape[1]] * along, MIN_RESOLUTION))
 
 
+def cauchy_weights(off: F64) -> F64:
+    """(N,) weights of residuals (N,), which are not negative, by their own median."""
+    scale = max(1.4826 * float(np.median(off)), 1e-9)
+    return np.asarray(1.0 / (1.0 + (off / (2.0 * scale)) ** 2))
+
+
 def pose_from_points(points_m: F64, uv_px: F64, K: F64, flags: int) -> F64 | None:
     """(4, 4) T_camera_points of (N, 3) points at (N, 2) pixels; N is 4 or more. ``flags`` is one of
     OpenCV's SOLVEPNP methods, such as EPnP."""

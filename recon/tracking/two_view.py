@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.camera_model import project
+from recon.camera_model import rays
 from recon.plane import plane_normal
 from recon.tracking import bundle, robust_geometry
 from recon.types import F64, Bool
@@ -43,25 +43,21 @@ def translation_direction(rays_a: F64, rays_b: F64, R_b_a: F64) -> F64:
     Every match says that t lies in the plane of its two rays; the least-squares normal is
     re-weighted (Cauchy) against outliers. The sign is the one that puts most points in front.
     """
-    normals = np.cross(rays_b, rays_a @ R_b_a.T)
+    turned = rays_a @ R_b_a.T
+    normals = np.cross(rays_b, turned)
     weights = np.ones(len(normals))
-    t = np.zeros(3)
     for _ in range(10):
         _, vectors = np.linalg.eigh((normals * weights[:, None]).T @ normals)
         t = vectors[:, 0]
-        error = np.abs(normals @ t)
-        scale = max(1.4826 * float(np.median(error)), 1e-9)
-        weights = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
-    moved = rays_b - (rays_a @ R_b_a.T) * (rays_b[:, 2:] / (rays_a @ R_b_a.T)[:, 2:])
+        weights = robust_geometry.cauchy_weights(np.abs(normals @ t))
+    moved = rays_b - turned * (rays_b[:, 2:] / turned[:, 2:])
     return np.asarray(t if float(np.median(moved @ t)) >= 0 else -t)
 
 
-def _candidates(
-    uv_a: F64, uv_b: F64, rays_a: F64, rays_b: F64, K: F64, R_b_a: F64 | None
-) -> list[tuple[F64, F64]]:
+def _candidates(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> list[tuple[F64, F64]]:
     out: list[tuple[F64, F64]] = []
     if R_b_a is not None:
-        out.append((R_b_a, translation_direction(rays_a, rays_b, R_b_a)))
+        out.append((R_b_a, translation_direction(rays(K, uv_a), rays(K, uv_b), R_b_a)))
     by_essential = robust_geometry.relative_pose(uv_a, uv_b, K)
     if by_essential is not None and by_essential[2] > 8:
         out.append(by_essential[:2])
@@ -78,7 +74,7 @@ def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64) -> TwoView | None:
     """Bundle-adjusted candidate with the baseline set back to one, or None."""
     T_b_a = se3.compose(R, t)
     for _ in range(2):
-        points, angle = bundle.triangulate(np.eye(4), T_b_a, K, uv_a, uv_b)
+        points, angle, _ = bundle.triangulate(np.eye(4), T_b_a, K, uv_a, uv_b)
         use = np.flatnonzero(np.isfinite(points[:, 0]) & (angle > MIN_PARALLAX_RAD))
         if use.size < MIN_INLIERS:
             return None
@@ -98,22 +94,12 @@ def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64) -> TwoView | None:
         if not 1e-6 < length < 1e6:
             return None
         T_b_a[:3, 3] /= length
-    points, angle = bundle.triangulate(np.eye(4), T_b_a, K, uv_a, uv_b)
-    error = np.maximum(
-        reprojection_error(np.eye(4), points, K, uv_a), reprojection_error(T_b_a, points, K, uv_b)
-    )
+    points, angle, error = bundle.triangulate(np.eye(4), T_b_a, K, uv_a, uv_b)
     inliers = (error < MAX_ERROR_PX) & (angle > MIN_PARALLAX_RAD)
     if inliers.sum() < MIN_INLIERS:
         return None
     points[~inliers] = np.nan
     return TwoView(T_b_a, points, inliers, float(np.median(angle[inliers])))
-
-
-def reprojection_error(T_camera_world: F64, points_m: F64, K: F64, uv_px: F64) -> F64:
-    """(N,) distance in pixels; inf for points behind the camera or NaN."""
-    uv = project(K, se3.transform(T_camera_world, points_m))
-    error = np.linalg.norm(uv - uv_px, axis=1)
-    return np.asarray(np.where(np.isfinite(error), error, np.inf))
 
 
 def solve(
@@ -130,12 +116,8 @@ def solve(
     """
     if uv_a.shape[0] < 30 or not robust_geometry.span_a_plane(uv_a, uv_b):
         return None
-    K_inv = np.linalg.inv(K)
-    one = np.ones((uv_a.shape[0], 1))
-    rays_a = np.hstack([uv_a, one]) @ K_inv.T
-    rays_b = np.hstack([uv_b, one]) @ K_inv.T
     found: list[tuple[TwoView, float]] = []
-    for R, t in _candidates(uv_a, uv_b, rays_a, rays_b, K, R_b_a):
+    for R, t in _candidates(uv_a, uv_b, K, R_b_a):
         view = _refine(R, t, uv_a, uv_b, K)
         if view is None:
             continue

@@ -372,13 +372,16 @@ def test_three_keyframes_show_the_readout_first() -> None:
 
 
 @pytest.mark.parametrize(("sharpness", "expected"), [(1e-3, 0.03), (1e6, 0.012)])
-def test_a_known_readout_gives_way_to_sharp_images_alone(sharpness: float, expected: float) -> None:
+def test_a_known_readout_gives_way_to_sharp_images_alone(
+    sharpness: float, expected: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     clock = RowClock(replace(PLAIN, shutter=Shutter(0.03)))
 
     def cost(window: object, tried_s: float, K: F64) -> tuple[float, int]:
         return 100.0 + sharpness * (1e3 * (tried_s - 0.012)) ** 2, 400
 
-    search = ReadoutSearch(clock, PLAIN.K, cost)
+    monkeypatch.setattr(readout_search, "window_cost", cost)
+    search = ReadoutSearch(clock, PLAIN.K)
     for first in range(0, 40, 10):
         search.update([keyframe_at(first + k, np.eye(4), is_measured=True) for k in range(5)])
     assert clock.readout_s == pytest.approx(expected)

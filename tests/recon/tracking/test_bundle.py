@@ -162,8 +162,11 @@ def test_triangulation_finds_points_and_refuses_those_behind() -> None:
         P = se3.transform(pose, points)
         return np.asarray(P[:, :2] / P[:, 2:] * 1000 + [640, 360])
 
-    points, angle = bundle.triangulate(a, b, K, pixels(a, X), pixels(b, X))
+    points, angle, error = bundle.triangulate(a, b, K, pixels(a, X), pixels(b, X))
     np.testing.assert_allclose(points, X, atol=1e-6)
-    assert (angle > 0.05).all()
-    behind, _ = bundle.triangulate(a, b, K, pixels(b, X), pixels(a, X))
-    assert np.isnan(behind).any()
+    assert (angle > 0.05).all() and error.max() < 1e-6
+    off_line = pixels(b, X) + np.array([0.0, 4.0])  # as far from both images, across the baseline
+    _, _, error = bundle.triangulate(a, b, K, pixels(a, X), off_line)
+    assert ((error > 1.0) & (error < 4.0)).all()
+    behind, _, off = bundle.triangulate(a, b, K, pixels(b, X), pixels(a, X))
+    assert np.isnan(behind).any() and np.isinf(off[np.isnan(behind[:, 0])]).all()
