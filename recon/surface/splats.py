@@ -392,10 +392,7 @@ def _hide(splats: Splats, view: TextureView, left: F32) -> None:
     h, w = left.shape
     rows, _ = _in_view(splats, view.K, (w, h), view.T_world_camera)
     flat = _projected(splats, rows, view.K, (w, h), view.T_world_camera)
-    pixels = np.empty((h, w, 4), np.float32)
-    pixels[..., 3] = left
-    _blend(flat, splats.opacity.take(rows), NO_COLOURS, pixels, NO_SHARES, 1.0 - COVERED)
-    left[:] = pixels[..., 3]
+    _cover(flat, splats.opacity.take(rows), left, 1.0 - COVERED)
 
 
 def _fitted(
@@ -581,7 +578,7 @@ FADING = np.column_stack([_FADING[:-1], np.diff(_FADING)])
 """(1024, 2) how much a Gaussian hides so many 1024ths of FAINTEST from its middle, and what the
 next one differs by."""
 
-NO_COLOURS, NO_SHARES = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+NO_SHARES = np.zeros(0, np.float32)
 
 
 @njit(cache=True, nogil=True)
@@ -590,23 +587,21 @@ def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: fl
 
     ``pixels`` (h, w, 4) are colours over black and the share of light that comes from behind; one
     with less than ``done`` of it takes no more. ``shares`` takes the share of each Gaussian
-    of the light of each pixel that it reaches. NO_COLOURS are not drawn, NO_SHARES not kept.
+    of the light of each pixel that it reaches; NO_SHARES are not kept.
     """
     (h, w), light = pixels.shape[:2], pixels.reshape(-1, 4)
-    has_colours, keeps = rgb.size > 0, shares.size > 0
+    keeps = shares.size > 0
     scale = np.float32(1024.0 / FAINTEST)
     half = scale * np.float32(0.5)
     most, least, enough = np.float32(LARGEST_ALPHA), np.float32(SMALLEST_ALPHA), np.float32(done)
     zero, end = np.float32(0.0), np.float32(1024.0)
     at, one = np.uint64(0), np.uint64(1)  # without a sign none counts from the end
-    red = green = blue = zero
     for n in range(flat.shape[0]):
         u, v, reach_u, reach_v = flat[n, 0], flat[n, 1], flat[n, 5], flat[n, 6]
         uu, uv, vv = half * flat[n, 2], scale * flat[n, 3], half * flat[n, 4]
         first_row, last_row = _span(v, reach_v, h)
         first, last = _span(u, reach_u, w)
-        if has_colours:
-            red, green, blue = rgb[n, 0], rgb[n, 1], rgb[n, 2]
+        red, green, blue = rgb[n, 0], rgb[n, 1], rgb[n, 2]
         for row in range(first_row, last_row):
             dv = np.float32(row) - v
             along, across = uv * dv, vv * dv * dv
@@ -623,15 +618,47 @@ def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: fl
                 alpha = min(opacity[n] * near, most)
                 share = alpha * before
                 share = share if is_near & (alpha >= least) & (before >= enough) else zero
-                if has_colours:
-                    light[p, 0] += share * red
-                    light[p, 1] += share * green
-                    light[p, 2] += share * blue
+                light[p, 0] += share * red
+                light[p, 1] += share * green
+                light[p, 2] += share * blue
                 light[p, 3] = before - share
                 p += one
                 if keeps:
                     shares[at] = share
                     at += one
+
+
+@njit(cache=True, nogil=True)
+def _cover(flat: F32, opacity: F32, left: F32, done: float) -> None:
+    """What :func:`_blend` does to the share of light ``left`` (h, w), with branches: most pixels
+    are soon covered."""
+    (h, w), light = left.shape, left.reshape(-1)
+    scale = np.float32(1024.0 / FAINTEST)
+    half = scale * np.float32(0.5)
+    most, least, enough = np.float32(LARGEST_ALPHA), np.float32(SMALLEST_ALPHA), np.float32(done)
+    zero, end, one = np.float32(0.0), np.float32(1024.0), np.uint64(1)
+    for n in range(flat.shape[0]):
+        u, v, reach_u, reach_v = flat[n, 0], flat[n, 1], flat[n, 5], flat[n, 6]
+        uu, uv, vv = half * flat[n, 2], scale * flat[n, 3], half * flat[n, 4]
+        first_row, last_row = _span(v, reach_v, h)
+        first, last = _span(u, reach_u, w)
+        for row in range(first_row, last_row):
+            dv = np.float32(row) - v
+            along, across = uv * dv, vv * dv * dv
+            p = np.uint64(row * w + first)
+            for col in range(first, last):
+                before = light[p]
+                if before >= enough:
+                    du = np.float32(col) - u
+                    far = (uu * du + along) * du + across
+                    if far < end:
+                        far = max(far, zero)
+                        step = np.uint32(far)
+                        near = FADING[step, 0] + (far - np.float32(step)) * FADING[step, 1]
+                        alpha = min(opacity[n] * near, most)
+                        if alpha >= least:
+                            light[p] = before - alpha * before
+                p += one
 
 
 @njit(cache=True, nogil=True)

@@ -207,10 +207,10 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     for name, fit in fits.items():
         moved, near = true(fit), _near_steps(image, truth, fit)
         there = known & (moved.max(axis=2) > 0)
-        moved = exposed_as(colour, moved, there)
+        exposed = exposed_as(colour, moved, there)
         out[name] = {
-            "psnr_db": psnr_db(colour, moved, there),
-            "steps_psnr_db": psnr_db(colour, moved, there & near),
+            "psnr_db": psnr_db(colour, exposed, there),
+            "steps_psnr_db": psnr_db(colour, exposed, there & near),
         }
     if not len(found.likeness):
         return out
