@@ -94,7 +94,7 @@ class Rig:
 
     @property
     def is_altitude_missing(self) -> bool:
-        """True when there are positions, and none has an altitude."""
+        """True when there are positions, and none has an altitude other than 0."""
         return self.georeference != "none" and not self._is_altitude_known
 
     def prior(self, state: VehicleState | None, tag: GeoTag | None) -> PosePrior:
@@ -105,7 +105,7 @@ class Rig:
         """
         R, tilt, yaw = self._rotation(state, tag)
         fix = self._fix(state, tag)
-        if fix is not None and fix.alt_amsl_m is not None:
+        if fix is not None and fix.alt_amsl_m:  # devices that know none write 0
             self._is_altitude_known = True
             self._is_altitude_stated |= fix.is_claimed
         position, sigma = self._position(fix)

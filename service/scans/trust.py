@@ -176,8 +176,8 @@ def trust_of(
         limits.append(_uncertain(focal))
     if NO_ALTITUDE in assumed and georeference != BY_SURVEY:
         limits.append(
-            "no position has an altitude: heights are above the scan's origin, not above sea "
-            "level; give control points"
+            "no position has an altitude, or all say 0: heights are above the scan's origin, not "
+            "above sea level; give control points"
         )
     elif "altitude" in assumed and georeference != BY_SURVEY:
         limits.append(

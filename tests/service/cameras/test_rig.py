@@ -111,11 +111,12 @@ def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     assert some.is_altitude_assumed and some.is_pressure_altitude
     some.prior(None, replace(tag, sigma_v_m=3.4))
     assert not some.is_altitude_assumed
-    some = rig()
-    some.prior(None, replace(tag, alt_amsl_m=None, sigma_v_m=3.4))
-    assert some.is_altitude_missing and not rig().is_altitude_missing
-    some.prior(None, tag)
-    assert some.is_altitude_assumed and not some.is_altitude_missing
+    for missing in (None, 0.0):
+        some = rig()
+        some.prior(None, replace(tag, alt_amsl_m=missing, sigma_v_m=3.4))
+        assert some.is_altitude_missing and not rig().is_altitude_missing
+        some.prior(None, tag)
+        assert some.is_altitude_assumed and not some.is_altitude_missing
     bare = rig().prior(None, replace(tag, relative_alt_m=None))
     assert prior.sigma_position_m is not None and bare.sigma_position_m is not None
     assert prior.sigma_position_m[2] < 10.0 < bare.sigma_position_m[2]  # a drone's barometer
