@@ -582,6 +582,15 @@ NO_SHARES = np.zeros(0, np.float32)
 
 
 @njit(cache=True, nogil=True)
+def _alpha(far: float, opacity: float) -> float:
+    """How much a Gaussian hides at ``far`` 1024ths of FAINTEST from its middle, 0 to below 1024."""
+    step = np.uint32(far)
+    near = FADING[step, 0] + (far - np.float32(step)) * FADING[step, 1]
+    alpha: float = min(opacity * near, np.float32(LARGEST_ALPHA))
+    return alpha
+
+
+@njit(cache=True, nogil=True)
 def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: float) -> None:
     """Draw Gaussians one behind the other.
 
@@ -593,7 +602,7 @@ def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: fl
     keeps = shares.size > 0
     scale = np.float32(1024.0 / FAINTEST)
     half = scale * np.float32(0.5)
-    most, least, enough = np.float32(LARGEST_ALPHA), np.float32(SMALLEST_ALPHA), np.float32(done)
+    least, enough = np.float32(SMALLEST_ALPHA), np.float32(done)
     zero, end = np.float32(0.0), np.float32(1024.0)
     at, one = np.uint64(0), np.uint64(1)  # without a sign none counts from the end
     for n in range(flat.shape[0]):
@@ -612,10 +621,7 @@ def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: fl
                 far = (uu * du + along) * du + across
                 is_near = far < end  # also no NaN, nor what no integer holds
                 far = max(far, zero) if is_near else zero
-                step = np.uint32(far)
-                between = far - np.float32(step)
-                near = FADING[step, 0] + between * FADING[step, 1]
-                alpha = min(opacity[n] * near, most)
+                alpha = _alpha(far, opacity[n])
                 share = alpha * before
                 share = share if is_near & (alpha >= least) & (before >= enough) else zero
                 light[p, 0] += share * red
@@ -635,7 +641,7 @@ def _cover(flat: F32, opacity: F32, left: F32, done: float) -> None:
     (h, w), light = left.shape, left.reshape(-1)
     scale = np.float32(1024.0 / FAINTEST)
     half = scale * np.float32(0.5)
-    most, least, enough = np.float32(LARGEST_ALPHA), np.float32(SMALLEST_ALPHA), np.float32(done)
+    least, enough = np.float32(SMALLEST_ALPHA), np.float32(done)
     zero, end, one = np.float32(0.0), np.float32(1024.0), np.uint64(1)
     for n in range(flat.shape[0]):
         u, v, reach_u, reach_v = flat[n, 0], flat[n, 1], flat[n, 5], flat[n, 6]
@@ -652,10 +658,7 @@ def _cover(flat: F32, opacity: F32, left: F32, done: float) -> None:
                     du = np.float32(col) - u
                     far = (uu * du + along) * du + across
                     if far < end:
-                        far = max(far, zero)
-                        step = np.uint32(far)
-                        near = FADING[step, 0] + (far - np.float32(step)) * FADING[step, 1]
-                        alpha = min(opacity[n] * near, most)
+                        alpha = _alpha(max(far, zero), opacity[n])
                         if alpha >= least:
                             light[p] = before - alpha * before
                 p += one
