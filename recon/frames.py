@@ -31,6 +31,13 @@ R_GIMBAL_CAMERA: F64 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.
 """Optical axes to the gimbal's FRD axes: z forward becomes x, x right becomes y."""
 
 
+def gimbal_from_camera(image_roll_deg: float) -> F64:
+    """R_gimbal_camera (3, 3) where images are turned clockwise by so much: at 90 degrees what is up
+    for the head is to the right in them."""
+    c, s = np.cos(np.radians(image_roll_deg)), np.sin(np.radians(image_roll_deg))
+    return np.asarray(R_GIMBAL_CAMERA @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+
+
 def rotation_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> F64:
     """R_parent_child of intrinsic yaw, pitch, roll (Z-Y-X), as MAVLink's ATTITUDE means it."""
     cr, sr = np.cos(roll_rad), np.sin(roll_rad)

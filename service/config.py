@@ -50,6 +50,11 @@ class CameraConfig:
     mount_roll_deg: float = key(0.0, "fixed mount: roll of the optical axis in the body frame")
     mount_pitch_deg: float = key(-90.0, "fixed mount: -90 looks straight down, 0 looks ahead")
     mount_yaw_deg: float = key(0.0, "fixed mount: 0 points the image's top to the nose")
+    image_roll_deg: float | Literal["auto"] = key(
+        "auto",
+        "images turned clockwise against gimbal or mount; auto: 0 unless they turn as the "
+        "telemetry does by 90, 180 or 270",
+    )
     lever_forward_m: float = key(0.0, "camera ahead of the autopilot's position, body frame")
     lever_right_m: float = key(0.0, "camera to the right of it, body frame")
     lever_down_m: float = key(0.0, "camera below it, body frame")
@@ -70,8 +75,9 @@ class CameraConfig:
         lever_m = (-100, 100)
         _check_ranges(
             self, mount_roll_deg=(-180, 180), mount_pitch_deg=(-180, 180),
-            mount_yaw_deg=(-360, 360), lever_forward_m=lever_m, lever_right_m=lever_m,
-            lever_down_m=lever_m, latency_ms=(-10_000, 10_000), readout_ms=(0, 200),
+            mount_yaw_deg=(-360, 360), image_roll_deg=(-360, 360), lever_forward_m=lever_m,
+            lever_right_m=lever_m, lever_down_m=lever_m, latency_ms=(-10_000, 10_000),
+            readout_ms=(0, 200),
         )  # fmt: skip
 
 

@@ -114,6 +114,27 @@ class LatencyWatch:
             return None
         return self._about(Attitudes(attitudes), 0.0)
 
+    def image_roll(
+        self, attitudes: Sequence[tuple[int, Quaternion]], R_head: F64, latency_ms: float
+    ) -> tuple[float, float] | None:
+        """The angle, rad, by which images are turned clockwise about the line of sight against a
+        head that is ``R_head`` (3, 3) times the attitudes' axes, and the correlation of the turns
+        across it then, 0 to 1; None with too few turns."""
+        if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
+            return None
+        track = Attitudes(attitudes)
+        seen = self._turns(track)
+        fit = _fit(seen, track, 1e-3 * latency_ms)
+        if fit is None:
+            return None
+        times = seen.start_s[fit.good], seen.end_s[fit.good]
+        turns, _ = track.turns(*(time_s - 1e-3 * latency_ms for time_s in times))
+        head, images = turns @ R_head.T, seen.rate[fit.good] * (times[1] - times[0])[:, None]
+        a, b = (turn[:, 1] + 1j * turn[:, 2] for turn in (head, images))  # across the line of sight
+        power = float(np.linalg.norm(a) * np.linalg.norm(b))
+        together = complex(np.vdot(a, b))
+        return float(np.angle(together)), abs(together) / max(power, 1e-30)
+
     def rate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> tuple[float, float] | None:
         """How fast the latency grows, seconds in a second, and its sigma: by the latencies of the
         earlier and of the later half of the frames. None where one of them is not sure."""

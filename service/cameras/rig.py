@@ -10,7 +10,13 @@ import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
-from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy, rpy_from_rotation
+from recon.frames import (
+    R_ENU_NED,
+    R_GIMBAL_CAMERA,
+    gimbal_from_camera,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
 from recon.posegraph.ground import ASSUMED_TILT_RAD
 from recon.types import F64, PosePrior
 from service.cameras.source import GeoTag
@@ -63,6 +69,17 @@ def turn_sigma_rad_s(gap_s: float, sigma_time_s: float = 0.0) -> float:
     return math.hypot(RATE_RAD_S, CHANGE_RAD_S2 * away_s)
 
 
+def body_from_head(camera: CameraConfig) -> F64:
+    """R_body_head (3, 3) of a fixed mount."""
+    mount_deg = camera.mount_roll_deg, camera.mount_pitch_deg, camera.mount_yaw_deg
+    return rotation_from_rpy(*(math.radians(angle) for angle in mount_deg))
+
+
+def stated_roll_deg(camera: CameraConfig) -> float:
+    """The images' roll against gimbal or mount before they show it."""
+    return 0.0 if camera.image_roll_deg == "auto" else camera.image_roll_deg
+
+
 class Rig:
     """Turns vehicle states and image tags into priors on the camera's pose. The scan's origin is
     the first known position; before it there are no positions."""
@@ -78,14 +95,12 @@ class Rig:
         self._lever_body = np.array(
             [camera.lever_forward_m, camera.lever_right_m, camera.lever_down_m]
         )
-        self._R_body_camera = (
-            rotation_from_rpy(
-                math.radians(camera.mount_roll_deg),
-                math.radians(camera.mount_pitch_deg),
-                math.radians(camera.mount_yaw_deg),
-            )
-            @ R_GIMBAL_CAMERA
-        )
+        self.turn_images(stated_roll_deg(camera))
+
+    def turn_images(self, image_roll_deg: float) -> None:
+        """Take images as turned clockwise by so much against gimbal or mount from now on."""
+        self._R_head_camera = gimbal_from_camera(image_roll_deg)
+        self._R_body_camera = body_from_head(self._camera) @ self._R_head_camera
 
     @property
     def is_altitude_assumed(self) -> bool:
@@ -165,7 +180,7 @@ class Rig:
         if state is not None and self._fusion.attitude:
             gimbal = state.q_ned_gimbal_wxyz
             if gimbal is not None and self._camera.mount != "fixed":
-                R = R_ENU_NED @ se3.rotation_from_quaternion(gimbal) @ R_GIMBAL_CAMERA
+                R = R_ENU_NED @ se3.rotation_from_quaternion(gimbal) @ self._R_head_camera
                 return R, state.sigma_gimbal_rad or 0.02, state.sigma_yaw_rad or 0.1
             body = state.q_ned_body_wxyz
             if body is not None and self._camera.mount != "gimbal" and not self.is_stabilised:

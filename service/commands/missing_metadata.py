@@ -31,7 +31,7 @@ from service.cameras.video import metadata, subtitles
 from service.config import change
 from service.errors import InputError
 from service.flight.scan import Scan, ScanInputs, check_new, create_store
-from service.flight.telemetry_check import STABILISED
+from service.flight.telemetry_check import STABILISED, turned_note
 from service.stream.validity import MAX_TIME_NS, is_time
 
 if TYPE_CHECKING:  # a flight with a camera model does without calibration
@@ -196,7 +196,7 @@ def with_stated_readout(
 class Correction:
     """What the images of a scan correct, for a scan that is right from its start."""
 
-    of: str  # "readout", "clock", "clock's rate", "mount"
+    of: str  # "readout", "clock", "clock's rate", "mount", "roll"
     changed: dict[str, Any]  # of its inputs
 
 
@@ -216,6 +216,10 @@ def correction_of(
         config = change(scan.inputs.config, "camera.mount", "gimbal")
         notes = (*scan.inputs.notes, STABILISED)
         return Correction("mount", {"config": config, "notes": notes})
+    if "roll" in unsure and (roll_deg := scan.check.image_roll_deg):
+        config = change(scan.inputs.config, "camera.image_roll_deg", f"{roll_deg:.0f}")
+        notes = (*scan.inputs.notes, turned_note(roll_deg))
+        return Correction("roll", {"config": config, "notes": notes})
     shutter = scan.found_shutter() if "readout" in unsure else None
     if shutter is None:
         return None

@@ -114,6 +114,7 @@ def replay(
         if not realtime and parse_source(video)[0] == "file":
             # What its images may correct; then its scan begins again.
             unsure = {"readout", "mount"}
+            unsure |= {"roll"} if chosen.camera.image_roll_deg == "auto" else set()
             is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)
             is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
             if not (is_of_camera or is_clock_given):

@@ -13,10 +13,10 @@ from mavlink.component.control import CameraView
 from mavlink.component.status import BodyOdometry
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
-from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, gimbal_from_camera
 from recon.pipeline.mapper import FramePosed
-from recon.types import F64, Camera
-from service.cameras.rig import Rig
+from recon.types import F64, Camera, PosePrior
+from service.cameras.rig import Rig, body_from_head, stated_roll_deg
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.georeference import LocalFrame
 
@@ -37,8 +37,8 @@ class OdometryReport:
     def __init__(self, camera: CameraConfig, send: Callable[[BodyOdometry, int], object]) -> None:
         """``send(odometry, time_ns)`` takes the result, at the frame's exposure."""
         self._send = send
-        rpy = np.radians([camera.mount_roll_deg, camera.mount_pitch_deg, camera.mount_yaw_deg])
-        self._R_body_head = rotation_from_rpy(*map(float, rpy))
+        self._R_body_head = body_from_head(camera)
+        self._R_head_camera = gimbal_from_camera(stated_roll_deg(camera))
         self._fixed = camera.mount == "fixed"
         self._last: tuple[int, int, F64] | None = None  # time, segment, position
         self._velocity: F64 | None = None  # NED, m/s
@@ -50,8 +50,8 @@ class OdometryReport:
         if pose is None or not frame.is_placed:
             return
         position: F64 = np.asarray(R_ENU_NED.T @ pose.T_world_camera[:3, 3])
-        R_ned_head = R_ENU_NED.T @ pose.T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
-        R_ned_body: F64 = np.asarray(R_ned_head @ self._body_of_head(state))
+        R_ned_camera = R_ENU_NED.T @ pose.T_world_camera[:3, :3]
+        R_ned_body: F64 = np.asarray(R_ned_camera @ self._camera_from_body(frame.prior, state))
         velocity = self._move(frame.time_ns, frame.segment, position)
         w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_body))
         a, b, c = (float(v) for v in R_ned_body.T @ velocity)
@@ -67,14 +67,17 @@ class OdometryReport:
         )
         self._send(odometry, frame.time_ns)
 
-    def _body_of_head(self, state: VehicleState | None) -> F64:
-        """(3, 3) body's attitude in the head's axes, by telemetry or by the fixed mount."""
-        if state is not None and not self._fixed:
-            head, body = state.q_ned_gimbal_wxyz, state.q_ned_body_wxyz
-            if head is not None and body is not None:
-                R_ned_head, R_ned_body = map(se3.rotation_from_quaternion, (head, body))
-                return np.asarray(R_ned_head.T @ R_ned_body)
-        return np.asarray(self._R_body_head.T)
+    def _camera_from_body(self, prior: PosePrior, state: VehicleState | None) -> F64:
+        """R_camera_body (3, 3) by telemetry or by the fixed mount."""
+        R_body_head = self._R_body_head
+        if state is not None and state.q_ned_body_wxyz is not None:
+            R_ned_body = se3.rotation_from_quaternion(state.q_ned_body_wxyz)
+            if prior.R_world_camera is not None and not prior.is_view_assumed:
+                # It knows of a roll of the images that was found on the way.
+                return np.asarray(prior.R_world_camera.T @ R_ENU_NED @ R_ned_body)
+            if state.q_ned_gimbal_wxyz is not None and not self._fixed:
+                R_body_head = R_ned_body.T @ se3.rotation_from_quaternion(state.q_ned_gimbal_wxyz)
+        return np.asarray((R_body_head @ self._R_head_camera).T)
 
     def _move(self, time_ns: int, segment: int, position: F64) -> F64:
         """The velocity by the last step; one more reset where that was none of the vehicle's."""

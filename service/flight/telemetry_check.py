@@ -1,4 +1,4 @@
-"""Telemetry checked against the images: the camera's latency, the gimbal's frame.
+"""Telemetry checked against the images: the camera's latency and roll, the gimbal's frame.
 
 The operator is warned once; the latency found is applied when ``camera.latency`` is "auto",
 the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
@@ -11,15 +11,18 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from mavlink.telemetry.gimbal import FrameVerdict, frame_by_images, is_stabilised
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import KEPT, SURE, LatencyEstimate, LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import GimbalFrame
-from recon.frames import R_GIMBAL_CAMERA
+from recon.frames import gimbal_from_camera
 from recon.se3 import quaternion_from_rotation
 from recon.tracking.frame import Frame, Tracking
 from recon.types import F64
+from service.cameras.rig import body_from_head, stated_roll_deg
 from service.config import CameraConfig
 from service.scans.trust import is_another_latency
 
@@ -36,6 +39,10 @@ MIN_RATE, RATE_SIGMAS = 3e-4, 6.0
 of it, 29.97 from 30 images a second by three times as much."""
 
 CLOCK_OFF_SIGMAS = 10.0
+ROLL_SLACK_DEG = 20.0
+"""A sensor is mounted by quarter turns; images that turn otherwise against telemetry say that one
+of the two is wrong."""
+
 STILLS = 60  # images that are compared, where they come more slowly than REACH_NS holds
 
 
@@ -55,6 +62,7 @@ class TelemetryCheck:
         self._compared: LatencyEstimate | None = None
         self.frame: FrameVerdict | None = None
         self.is_stabilised = False  # the vehicle's attitude is not the camera's
+        self.image_roll_deg = stated_roll_deg(camera)
         self.reported: dict[str, str] = {}  # by subject
         self._history, self._warn = history, warn
         self._fixed = camera.mount == "fixed"
@@ -117,7 +125,8 @@ class TelemetryCheck:
             self._look(self._history, stamp_ns)
 
     def _turn(self, first_ns: int, second_ns: int, R_first_second: F64) -> None:
-        R = R_GIMBAL_CAMERA @ R_first_second @ R_GIMBAL_CAMERA.T  # in the head's axes
+        R_head_camera = gimbal_from_camera(self.image_roll_deg)
+        R = R_head_camera @ R_first_second @ R_head_camera.T
         w, x, y, z = (float(v) for v in quaternion_from_rotation(R))
         self._turns.add(first_ns, second_ns, (w, x, y, z))
 
@@ -178,6 +187,8 @@ class TelemetryCheck:
         self.latency = found or self.latency
         if found is not None:
             self._report_latency(found)
+            if self._is_turned(history, attitudes, found):
+                return  # what came before is in wrong axes
         if not self._fixed:
             settled = self.latency is not None and self.latency.is_settled
             latency = self.latency.latency_ms if settled and self.latency else self.applied_ms
@@ -192,6 +203,24 @@ class TelemetryCheck:
             self._once("latency", f"{text}: applied")
         elif is_another_latency(found.latency_ms, found.sigma_ms, self.applied_ms):
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
+
+    def _is_turned(
+        self, history: VehicleHistory, attitudes: list[tuple[int, Quaternion]], now: LatencyEstimate
+    ) -> bool:
+        """Find out once that images are turned by quarters against gimbal or mount."""
+        if self._camera.image_roll_deg != "auto" or self.image_roll_deg or now.correlation < SURE:
+            return False
+        is_body = self._fixed or history.gimbal_frame() is None
+        R_head = body_from_head(self._camera).T if is_body else np.eye(3)
+        found = self._turns.image_roll(attitudes, R_head, now.latency_ms)
+        roll_deg, correlation = (0.0, 0.0) if found is None else (math.degrees(found[0]), found[1])
+        quarters = round(roll_deg / 90.0)
+        if correlation < SURE or abs(roll_deg - 90.0 * quarters) > ROLL_SLACK_DEG or not quarters:
+            return False
+        self.image_roll_deg = 90.0 * (quarters % 4)
+        self._turns, self._last = LatencyWatch(), None
+        self._once("roll", turned_note(self.image_roll_deg))
+        return True
 
     def _judge_frame(self, history: VehicleHistory) -> None:
         """Correct the gimbal's declared reference when the images refute it."""
@@ -234,6 +263,14 @@ class TelemetryCheck:
         seen = frame.frame.value if frame is not None and frame.decided else None
         gimbal = {"used": used.value if used is not None else None, "by_pictures": seen}
         return {"camera_latency": latency} | ({"gimbal_frame": gimbal} if used is not None else {})
+
+
+def turned_note(image_roll_deg: float) -> str:
+    """What the images show of their roll, in words."""
+    return (
+        f"The images are turned clockwise by {image_roll_deg:.0f} degrees against the telemetry, "
+        f"as they turn with it: applied; set camera.image_roll_deg = {image_roll_deg:.0f}"
+    )
 
 
 STABILISED = (

@@ -41,6 +41,22 @@ def test_a_nadir_camera_of_a_vehicle_heading_east() -> None:
     np.testing.assert_allclose(right, [0, -1, 0], atol=1e-9)
 
 
+@pytest.mark.parametrize("q_gimbal", [None, q(0, -90, 0)])
+def test_images_turned_clockwise_by_a_quarter_have_the_head_s_top_on_their_right(
+    q_gimbal: F64 | None,
+) -> None:
+    state = VehicleState(
+        0, q_ned_body_wxyz=q(0, 0, 0), q_ned_gimbal_wxyz=q_gimbal, sigma_yaw_rad=0.1
+    )
+    stated, found = rig(CameraConfig(image_roll_deg=90.0)), rig()
+    found.turn_images(90.0)
+    for one in stated, found:
+        right, top, view = up_and_right(one.prior(state, None).R_world_camera)
+        np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)
+        np.testing.assert_allclose(right, [0, 1, 0], atol=1e-9)
+        np.testing.assert_allclose(top, [-1, 0, 0], atol=1e-9)
+
+
 def test_roll_to_the_right_looks_to_the_left() -> None:
     state = VehicleState(0, q_ned_body_wxyz=q(10, 0, 0), sigma_yaw_rad=0.1)
     _, _, view = up_and_right(rig().prior(state, None).R_world_camera)

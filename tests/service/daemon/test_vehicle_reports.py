@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,10 @@ from mavlink.telemetry.samples import PositionSample, VehicleState
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
-from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
+from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, gimbal_from_camera
 from recon.pipeline.mapper import FramePosed
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
-from recon.types import F64, Camera, Pose
+from recon.types import F64, Camera, Pose, PosePrior
 from service.config import CameraConfig, load_config
 from service.daemon.runtime import Daemon
 from service.daemon.vehicle_reports import OdometryReport, camera_view
@@ -76,6 +77,20 @@ def test_a_fixed_mount_needs_no_gimbal() -> None:
     mount = Rotation.from_euler("ZYX", [20.0, -60.0, 0.0], degrees=True)
     report = OdometryReport(camera, lambda o, t: sent.append(o))
     report.send(posed_at((0.0, 0.0, 30.0), 0, BODY * mount), None)
+    assert abs(float(np.dot(sent[0].q_ned_body, wxyz(BODY)))) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("is_found", [False, True])
+def test_the_body_is_upright_whatever_way_up_its_images_are(is_found: bool) -> None:
+    """The roll is stated, or found in flight, when the prior alone knows of it."""
+    sent: list[BodyOdometry] = []
+    camera = CameraConfig() if is_found else CameraConfig(image_roll_deg=90.0)
+    posed = posed_at((0.0, 0.0, 30.0), 0, HEAD)
+    T = posed.pose.T_world_camera if posed.pose is not None else np.eye(4)
+    T[:3, :3] = R_ENU_NED @ HEAD.as_matrix() @ gimbal_from_camera(90.0)
+    prior = PosePrior(R_world_camera=T[:3, :3], is_view_assumed=not is_found)
+    posed = replace(posed, frame=replace(posed.frame, prior=prior))
+    OdometryReport(camera, lambda o, t: sent.append(o)).send(posed, state())
     assert abs(float(np.dot(sent[0].q_ned_body, wxyz(BODY)))) == pytest.approx(1.0, abs=1e-9)
 
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import av
+import numpy as np
 import pytest
 from command_line import skyrelief
 
@@ -61,9 +62,24 @@ def simulated(folder: Path, *arguments: str) -> Path:
     return folder
 
 
-def replayed(flight: Path, out: Path, *more: str) -> dict[str, Any]:
+def upside_down(video: Path, out: Path) -> None:
+    """The video as of a camera that hangs upside down."""
+    with av.open(str(video)) as upright, av.open(out, "w") as turned:
+        turned.metadata["creation_time"] = upright.metadata["creation_time"]
+        source = upright.streams.video[0]
+        stream = turned.add_stream("libx264", source.average_rate, options={"crf": "16"})
+        stream.width, stream.height, stream.pix_fmt = source.width, source.height, "yuv420p"
+        for frame in upright.decode(source):
+            image = np.ascontiguousarray(frame.to_ndarray(format="bgr24")[::-1, ::-1])
+            again = av.VideoFrame.from_ndarray(image, format="bgr24")
+            again.pts, again.time_base = frame.pts, frame.time_base
+            turned.mux(stream.encode(again))
+        turned.mux(stream.encode(None))
+
+
+def replayed(flight: Path, out: Path, *more: str, video: str = "early.mp4") -> dict[str, Any]:
     done = skyrelief(
-        "replay", flight / "early.mp4", "--telemetry", flight / "flight.tlog", "--camera-model",
+        "replay", flight / video, "--telemetry", flight / "flight.tlog", "--camera-model",
         flight / "camera.yaml", "--out", out, "--json", "--set", "compute.stereo_width=160", *more,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -83,12 +99,25 @@ def test_a_video_goes_where_its_images_turn_with_the_log(flight: Path, tmp_path:
         assert store.header.started_unix_ns == pytest.approx(EPOCH_S * 1e9, abs=20e6)
 
 
+@pytest.mark.slow
+def test_a_camera_that_hangs_upside_down_is_found_by_its_images(
+    flight: Path, tmp_path: Path
+) -> None:
+    upside_down(flight / "early.mp4", flight / "turned.mp4")
+    found = replayed(flight, tmp_path / "scan", video="turned.mp4")
+    (note,) = (text for text in found["warnings"] if "turned clockwise" in text)
+    assert note.endswith("set camera.image_roll_deg = 180")
+    assert found["quality"]["trust"]["level"] == "georeferenced"
+    with ScanStore.open(tmp_path / "scan" / "scan.db") as store:
+        assert store.header.configuration["camera"]["image_roll_deg"] == 180.0
+
+
 @pytest.mark.parametrize(
     ("options", "unsure"),
     [
-        ([], {"readout", "mount", "clock", "clock's rate"}),
-        (["--video-epoch", str(EPOCH_S - 2.5)], {"readout", "mount"}),
-        (["--set", "camera.latency_ms=40"], {"readout", "mount"}),
+        ([], {"readout", "mount", "roll", "clock", "clock's rate"}),
+        (["--video-epoch", str(EPOCH_S - 2.5)], {"readout", "mount", "roll"}),
+        (["--set", "camera.latency_ms=40"], {"readout", "mount", "roll"}),
         (["--realtime"], set()),
     ],
 )
@@ -127,7 +156,7 @@ def test_a_date_for_a_log_without_one_leaves_its_clock_open(
     monkeypatch.setattr(missing_metadata, "load_log", lambda path, config: log)
     monkeypatch.setattr(replay, "fly", fly)
     replayed(brief, tmp_path / "scan", "--video-epoch", str(EPOCH_S))
-    assert asked == [(round(80e9), {"readout", "mount", "clock", "clock's rate"})]
+    assert asked == [(round(80e9), {"readout", "mount", "roll", "clock", "clock's rate"})]
 
 
 @pytest.mark.parametrize(

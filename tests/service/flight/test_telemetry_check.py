@@ -14,7 +14,7 @@ from mavlink.telemetry.history import HistoryConfig, VehicleHistory
 from mavlink.telemetry.latency import LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
-from recon.frames import R_GIMBAL_CAMERA
+from recon.frames import R_GIMBAL_CAMERA, gimbal_from_camera
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64
 from service.config import CameraConfig
@@ -70,17 +70,19 @@ def fly(
     gap: bool = False,
     hz: float = 15.0,
     rate: float = 0.0,
+    image_roll_deg: float = 0.0,
 ) -> list[int]:
     """Forty seconds of frames whose stamps are 70 ms late, and ever later by ``rate``; the times of
-    exposure."""
+    exposure. The images are turned clockwise by ``image_roll_deg``."""
     rng = np.random.default_rng(2)
     mount = Rotation.from_euler("Y", -math.pi / 3)
+    R_head_camera = gimbal_from_camera(image_roll_deg)
     exposed = []
     for k in range(round(40 * hz)):
         t = 1.0 + k / hz
         noise = Rotation.from_rotvec(rng.normal(0.0, noise_rad, 3))
         T = np.eye(4)
-        T[:3, :3] = (body(t, strength) * mount * noise).as_matrix() @ R_GIMBAL_CAMERA
+        T[:3, :3] = (body(t, strength) * mount * noise).as_matrix() @ R_head_camera
         stamp = round((t + LATE_S + rate * t) * S)
         lost = gap and 200 <= k < 205
         exposed.append(check.exposed_ns(stamp))
@@ -103,6 +105,40 @@ def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
     assert abs(latency["estimate_ms"] - 70.0) < 3.0 * latency["sigma_ms"]
     assert len(reported) == 1 and reported[0].endswith("by the images, 0 ms is set")
     assert check.is_clock_sure
+
+
+@pytest.mark.parametrize("gimbal", ["none", "honest"])
+@pytest.mark.parametrize("turned_deg", [90.0, 180.0, 270.0])
+def test_images_that_are_turned_by_quarters_are_found(gimbal: str, turned_deg: float) -> None:
+    reported: list[str] = []
+    camera = CameraConfig(mount_pitch_deg=-60.0)
+    check = TelemetryCheck(camera, history_of(gimbal, 1.0), reported.append)
+    fly(check, noise_rad=2e-3, image_roll_deg=turned_deg)
+    assert check.image_roll_deg == turned_deg
+    of_roll = [text for text in reported if "turned clockwise" in text]
+    assert len(of_roll) == 1 and of_roll[0].endswith(f"camera.image_roll_deg = {turned_deg:.0f}")
+    assert check.frame is None or not check.frame.refuted  # nothing is blamed on the gimbal
+
+
+@pytest.mark.parametrize(
+    ("stated", "turned_deg", "strength"),
+    [("auto", 0.0, 1.0), ("auto", 45.0, 1.0), ("auto", 90.0, 0.0), (0.0, 90.0, 1.0)],
+)
+def test_a_roll_that_is_stated_or_not_shown_stays(
+    stated: float | Literal["auto"], turned_deg: float, strength: float
+) -> None:
+    camera = CameraConfig(mount_pitch_deg=-60.0, image_roll_deg=stated)
+    check = TelemetryCheck(camera, history_of("none", strength))
+    fly(check, strength, image_roll_deg=turned_deg)
+    assert check.image_roll_deg == 0.0
+
+
+def test_a_roll_that_is_stated_is_that_of_the_images() -> None:
+    camera = CameraConfig(mount_pitch_deg=-60.0, image_roll_deg=90.0)
+    reported: list[str] = []
+    check = TelemetryCheck(camera, history_of("wrong", 1.0), reported.append)
+    fly(check, image_roll_deg=90.0)
+    assert check.frame is not None and check.frame.frame is GimbalFrame.BODY
 
 
 def test_a_flight_without_turns_leaves_its_clock_open() -> None:
