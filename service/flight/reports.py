@@ -25,7 +25,8 @@ MIN_FIXES = 10  # fixes before the track is held against them
 LEFT_OUT = {
     "position off": "positions far from the track were left out: does GNSS jump?",
     "position frozen": "positions only repeated the one before: is GNSS frozen?",
-    "heading off": "headings contradict the track and were left out: check the compass",
+    "heading off": "headings contradict the track and were left out: check the compass, and which "
+    "way up the camera is",
     "tilt off": "attitudes contradict the images and were left out: check the gimbal's frame",
     "view off": "images do not look as assumed without attitude: set camera.mount_pitch_deg",
     "altitude off": "altitudes stepped and were left out: check the barometer",
