@@ -28,6 +28,7 @@ from service.cameras.dji_metadata import stated_shutter
 from service.cameras.images import ImagesSource
 from service.cameras.lens import Lens, by_full_frame, by_view
 from service.cameras.video import metadata, subtitles
+from service.commands.recording_clock import RecordingClock
 from service.config import change
 from service.errors import InputError
 from service.flight.scan import Scan, ScanInputs, check_new, create_store
@@ -201,15 +202,16 @@ class Correction:
 
 
 def correction_of(
-    scan: Scan, unsure: Collection[str], has_ended: bool = False
+    scan: Scan, clock: RecordingClock, unsure: Collection[str], has_ended: bool = False
 ) -> Correction | None:
-    """What the images of the scan show by now, of what is ``unsure``; None before they do."""
+    """What the images of the scan show by now, of what is ``unsure``; None before they do.
+    ``clock`` is that of its recording."""
     if has_ended:
         scan.check.finish()
-    off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
+    off_ms = clock.off_ms(has_ended) if "clock" in unsure else None
     if off_ms is not None:
         return Correction("clock", at_another_time(scan.inputs, off_ms))
-    rate = scan.check.clock_rate(has_ended) if "clock's rate" in unsure else None
+    rate = clock.rate(has_ended) if "clock's rate" in unsure else None
     if rate is not None:
         return Correction("clock's rate", at_another_rate(scan.inputs, rate))
     if "mount" in unsure and scan.check.is_stabilised:

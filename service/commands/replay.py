@@ -209,6 +209,7 @@ def fly(
     What came before that is wrong, so such a scan is discarded, unless it goes to the ground.
     """
     from service.commands.missing_metadata import correction_of
+    from service.commands.recording_clock import RecordingClock
     from service.daemon.datalink import open_datalink
     from service.daemon.warm_up import has_kernels, load_kernels
     from service.flight.scan import Scan, create_store
@@ -219,6 +220,7 @@ def fly(
     link = open_datalink(store, inputs.config)
     unsure = unsure if link is None else ()
     scan = Scan(inputs, store)
+    clock = RecordingClock(scan.check)
     scan.worker.end_by(stop, PATIENCE_S)
     correction = None
     try:
@@ -229,9 +231,9 @@ def fly(
             scan.worker.prepare(load_kernels)  # the first view is some frames away
         with progress.part(work, of_rest=0.9):
             show = show_flown(inputs.source, progress)
-            scan.run(stop, show, is_enough=lambda scan: correction_of(scan, unsure))
+            scan.run(stop, show, is_enough=lambda scan: correction_of(scan, clock, unsure))
             if not stop.is_set():
-                correction = correction_of(scan, unsure, has_ended=True)
+                correction = correction_of(scan, clock, unsure, has_ended=True)
     finally:
         if correction is not None:
             scan.discard()

@@ -15,7 +15,7 @@ import numpy as np
 
 from mavlink.telemetry.gimbal import FrameVerdict, frame_by_images, is_stabilised
 from mavlink.telemetry.history import VehicleHistory
-from mavlink.telemetry.latency import KEPT, SURE, LatencyEstimate, LatencyWatch
+from mavlink.telemetry.latency import SURE, LatencyEstimate, LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import GimbalFrame
 from recon.frames import gimbal_from_camera
@@ -33,12 +33,6 @@ REACH_NS = 60_000_000_000  # how far back telemetry is compared with frames, at 
 AHEAD_NS = 2_000_000_000  # how far ahead of the newest frame; a recording's log goes on
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
 UNSEEN_S = 0.05  # sigma of a latency that the images have not shown yet
-MIN_CLOCK_OFF_MS = 100.0  # of a recording: less is a latency
-MIN_RATE, RATE_SIGMAS = 3e-4, 6.0
-"""Of a recording: by how much a clock gains that is surely another one. Crystals differ by a tenth
-of it, 29.97 from 30 images a second by three times as much."""
-
-CLOCK_OFF_SIGMAS = 10.0
 ROLL_SLACK_DEG = 20.0
 """A sensor is mounted by quarter turns; images that turn otherwise against telemetry say that one
 of the two is wrong."""
@@ -58,37 +52,34 @@ class TelemetryCheck:
     ) -> None:
         """``earlier_ms``, found by an earlier scan, is taken with "auto" until there is news."""
         self.latency: LatencyEstimate | None = None
-        self._in_log: LatencyEstimate | None = None  # in the whole log, when _compared with it
-        self._compared: LatencyEstimate | None = None
         self.frame: FrameVerdict | None = None
         self.is_stabilised = False  # the vehicle's attitude is not the camera's
         self.image_roll_deg = stated_roll_deg(camera)
         self.reported: dict[str, str] = {}  # by subject
-        self._history, self._warn = history, warn
+        self.history, self._warn = history, warn
         self._fixed = camera.mount == "fixed"
         self._earlier_ms = earlier_ms
-        self._camera = camera
+        self.camera = camera
         self.applied_ms = self._wanted_ms()
-        self._turns = LatencyWatch()
-        self._rated_ns: int | None = None  # the look whose frames gave no rate
+        self.turns = LatencyWatch()  # of the images
         self._last: tuple[int, int, F64] | None = None  # stamp, segment, R_odom_camera
-        self._seen_ns: int | None = None
-        self._next_ns: int | None = None
+        self.seen_ns: int | None = None  # stamp of the newest frame
+        self.next_look_ns: int | None = None  # stamp from which on all is evaluated again
 
     # ---- the latency in force ------------------------------------------------------------
 
     def set_camera(self, camera: CameraConfig) -> None:
         """Follow another ``camera.latency`` or ``latency_ms`` from the next frame on."""
-        self._camera = camera
+        self.camera = camera
 
     def _wanted_ms(self) -> float:
         """The latency to apply: the measured one if configured so, else the configured one."""
-        if self._camera.latency == "auto":
+        if self.camera.latency == "auto":
             if self.latency is not None and self.latency.is_settled:
                 return self.latency.latency_ms
             if self._earlier_ms is not None:
                 return self._earlier_ms
-        return self._camera.latency_ms
+        return self.camera.latency_ms
 
     @property
     def doubt_s(self) -> float:
@@ -100,8 +91,8 @@ class TelemetryCheck:
 
     def exposed_ns(self, stamp_ns: int) -> int:
         """When the frame of this stamp was exposed; later for every later frame."""
-        passed_ms = 0.0 if self._seen_ns is None else max(0, stamp_ns - self._seen_ns) * 1e-6
-        self._seen_ns = stamp_ns
+        passed_ms = 0.0 if self.seen_ns is None else max(0, stamp_ns - self.seen_ns) * 1e-6
+        self.seen_ns = stamp_ns
         change = self._wanted_ms() - self.applied_ms
         self.applied_ms += max(-SLEW * passed_ms, min(SLEW * passed_ms, change))
         return stamp_ns - round(self.applied_ms * 1e6)
@@ -110,7 +101,7 @@ class TelemetryCheck:
 
     def add(self, stamp_ns: int, frame: Frame) -> None:
         """Add a frame's pose by vision, at its stamp; evaluate all of them now and then."""
-        if self._history is None or frame.state is Tracking.SKIPPED:
+        if self.history is None or frame.state is Tracking.SKIPPED:
             return
         last, self._last = self._last, None
         if frame.is_placed:
@@ -118,72 +109,37 @@ class TelemetryCheck:
             self._last = (stamp_ns, frame.segment, T[:3, :3].copy())
             if last is not None and last[1] == frame.segment:
                 self._turn(last[0], stamp_ns, last[2].T @ T[:3, :3])
-        if self._next_ns is None:
-            self._next_ns = stamp_ns + LOOK_NS
-        elif stamp_ns >= self._next_ns:
-            self._next_ns = stamp_ns + LOOK_NS
-            self._look(self._history, stamp_ns)
+        if self.next_look_ns is None:
+            self.next_look_ns = stamp_ns + LOOK_NS
+        elif stamp_ns >= self.next_look_ns:
+            self.next_look_ns = stamp_ns + LOOK_NS
+            self._look(self.history, stamp_ns)
 
     def _turn(self, first_ns: int, second_ns: int, R_first_second: F64) -> None:
         R_head_camera = gimbal_from_camera(self.image_roll_deg)
         R = R_head_camera @ R_first_second @ R_head_camera.T
         w, x, y, z = (float(v) for v in quaternion_from_rotation(R))
-        self._turns.add(first_ns, second_ns, (w, x, y, z))
+        self.turns.add(first_ns, second_ns, (w, x, y, z))
 
     @property
     def is_clock_sure(self) -> bool:
         """Whether the images turn with the log."""
         return self.latency is not None and self.latency.correlation >= SURE
 
-    def clock_off_ms(self, has_ended: bool = False) -> float | None:
-        """By how much a recording's stamps are surely late, beyond a camera's latency; or None.
-
-        A latency near by only gives rise to a search of the whole log, in which another turn may
-        look alike; so does the end of a recording that shows none.
-        """
-        near = self.latency
-        is_due = has_ended if near is None else self._off_ms(near) is not None
-        if self._history is None or not is_due:
-            return None
-        if near is not self._compared or (has_ended and self._in_log is None):
-            self._compared = near
-            self._in_log = self._turns.anywhere(self._attitudes(self._history)())
-        return None if self._in_log is None else self._off_ms(self._in_log)
-
-    def clock_rate(self, has_ended: bool = False) -> float | None:
-        """How many seconds a recording's clock surely gains in each of the log's; or None."""
-        is_due = has_ended or self._rated_ns != self._next_ns
-        if self._history is None or self._seen_ns is None or not is_due:
-            return None
-        self._rated_ns, first_ns = self._next_ns, self._turns.since_ns(KEPT)
-        if first_ns is None:
-            return None
-        near = self._attitudes(self._history)(first_ns - REACH_NS, self._seen_ns + AHEAD_NS)
-        found = self._turns.rate(near)
-        if found is None or abs(found[0]) < max(MIN_RATE, RATE_SIGMAS * found[1]):
-            return None
-        return found[0]
-
-    def _off_ms(self, found: LatencyEstimate) -> float | None:
-        if found.correlation < SURE:
-            return None
-        off_ms = found.latency_ms - self._camera.latency_ms
-        is_off = abs(off_ms) > max(MIN_CLOCK_OFF_MS, CLOCK_OFF_SIGMAS * found.sigma_ms)
-        return off_ms if is_off else None
-
     def finish(self) -> None:
-        if self._history is not None and self._seen_ns is not None:
-            self._look(self._history, self._seen_ns)
+        if self.history is not None and self.seen_ns is not None:
+            self._look(self.history, self.seen_ns)
 
-    def _attitudes(self, history: VehicleHistory) -> Callable[..., list[tuple[int, Quaternion]]]:
+    def attitudes(self, history: VehicleHistory) -> Callable[..., list[tuple[int, Quaternion]]]:
+        """Telemetry's attitudes of what the camera turns with."""
         return history.bodies if self._fixed else history.heads
 
     def _look(self, history: VehicleHistory, now_ns: int) -> None:
-        since_ns, stills_ns = now_ns - REACH_NS, self._turns.since_ns(STILLS)
+        since_ns, stills_ns = now_ns - REACH_NS, self.turns.since_ns(STILLS)
         if stills_ns is not None:
             since_ns = min(since_ns, stills_ns)
-        attitudes = self._attitudes(history)(since_ns, now_ns + AHEAD_NS)
-        found = self._turns.estimate(attitudes)
+        attitudes = self.attitudes(history)(since_ns, now_ns + AHEAD_NS)
+        found = self.turns.estimate(attitudes)
         self.latency = found or self.latency
         if found is not None:
             self._report_latency(found)
@@ -192,14 +148,14 @@ class TelemetryCheck:
         if not self._fixed:
             settled = self.latency is not None and self.latency.is_settled
             latency = self.latency.latency_ms if settled and self.latency else self.applied_ms
-            seen = frame_by_images(self._turns.long_turns, history.claimed_at, latency)
+            seen = frame_by_images(self.turns.long_turns, history.claimed_at, latency)
             self.frame = seen or self.frame
             self._judge_frame(history)
             self._judge_mount(history)
 
     def _report_latency(self, found: LatencyEstimate) -> None:
         text = f"Camera latency {found.latency_ms:.0f} ms by the images"
-        if self._camera.latency == "auto" and found.is_settled:
+        if self.camera.latency == "auto" and found.is_settled:
             self._once("latency", f"{text}: applied")
         elif is_another_latency(found.latency_ms, found.sigma_ms, self.applied_ms):
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
@@ -208,17 +164,17 @@ class TelemetryCheck:
         self, history: VehicleHistory, attitudes: list[tuple[int, Quaternion]], now: LatencyEstimate
     ) -> bool:
         """Find out once that images are turned by quarters against gimbal or mount."""
-        if self._camera.image_roll_deg != "auto" or self.image_roll_deg or now.correlation < SURE:
+        if self.camera.image_roll_deg != "auto" or self.image_roll_deg or now.correlation < SURE:
             return False
         is_body = self._fixed or history.gimbal_frame() is None
-        R_head = body_from_head(self._camera).T if is_body else np.eye(3)
-        found = self._turns.image_roll(attitudes, R_head, now.latency_ms)
+        R_head = body_from_head(self.camera).T if is_body else np.eye(3)
+        found = self.turns.image_roll(attitudes, R_head, now.latency_ms)
         roll_deg, correlation = (0.0, 0.0) if found is None else (math.degrees(found[0]), found[1])
         quarters = round(roll_deg / 90.0)
         if correlation < SURE or abs(roll_deg - 90.0 * quarters) > ROLL_SLACK_DEG or not quarters:
             return False
         self.image_roll_deg = 90.0 * (quarters % 4)
-        self._turns, self._last = LatencyWatch(), None
+        self.turns, self._last = LatencyWatch(), None
         self._once("roll", turned_note(self.image_roll_deg))
         return True
 
@@ -236,8 +192,8 @@ class TelemetryCheck:
 
     def _judge_mount(self, history: VehicleHistory) -> None:
         """Find out that a camera whose gimbal sends nothing is on one."""
-        if self._camera.mount == "auto" and history.gimbal_frame() is None:
-            turns = self._turns.long_turns
+        if self.camera.mount == "auto" and history.gimbal_frame() is None:
+            turns = self.turns.long_turns
             self.is_stabilised |= is_stabilised(turns, history.body_at, self.applied_ms)
         if self.is_stabilised:
             self._once("mount", STABILISED)
@@ -249,9 +205,9 @@ class TelemetryCheck:
 
     def summary(self) -> dict[str, Any]:
         """Findings, fit for JSON; empty without telemetry."""
-        if self._history is None:
+        if self.history is None:
             return {}
-        found, frame, used = self.latency, self.frame, self._history.gimbal_frame()
+        found, frame, used = self.latency, self.frame, self.history.gimbal_frame()
         latency: dict[str, Any] = {"applied_ms": round(self.applied_ms, 1)}
         if found is not None:
             latency |= {

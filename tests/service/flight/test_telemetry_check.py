@@ -9,88 +9,14 @@ from typing import Literal
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from turning_flight import LATE_S, S, Turns, body, fly, history_of, quaternion_of, seen
 
-from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.latency import LatencyWatch
-from mavlink.telemetry.quaternion import Quaternion
-from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
-from recon.frames import R_GIMBAL_CAMERA, gimbal_from_camera
-from recon.tracking.frame import NO_IMAGE, Frame, Tracking
-from recon.types import F64
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.samples import AttitudeSample, GimbalFrame
+from recon.frames import R_GIMBAL_CAMERA
+from recon.tracking.frame import Tracking
 from service.config import CameraConfig
 from service.flight.telemetry_check import AHEAD_NS, TelemetryCheck
-
-S = 1_000_000_000
-LATE_S = 0.07
-
-Turns = list[tuple[int, Quaternion]]
-
-
-def seen(state: Tracking, T_odom_camera: F64 | None = None, segment: int = 0) -> Frame:
-    return Frame(NO_IMAGE, 0, 0, state=state, segment=segment, T_keyframe_camera=T_odom_camera)
-
-
-def body(t: float, strength: float = 1.0) -> Rotation:
-    roll = strength * 0.1 * math.sin(2.9 * t)
-    pitch = strength * 0.08 * math.sin(1.7 * t + 0.5)
-    return Rotation.from_euler("ZYX", [strength * 0.8 * math.sin(0.3 * t), pitch, roll])
-
-
-def quaternion_of(R: Rotation) -> Quaternion:
-    x, y, z, w = map(float, R.as_quat())
-    return (w, x, y, z)
-
-
-def history_of(
-    gimbal: str, strength: float, yaw_frame: str = "auto",
-    kind: type[VehicleHistory] = VehicleHistory,
-) -> VehicleHistory:  # fmt: skip
-    """Telemetry of a camera fixed at 60 degrees below the nose.
-
-    The gimbal is "none", "honest" (earth), or "wrong": body-relative, but claims the earth.
-    """
-    history = kind(HistoryConfig(yaw_frame=yaw_frame))
-    mount = Rotation.from_euler("Y", -math.pi / 3)
-    for k in range(45 * 25):
-        t = k / 25
-        history.add(AttitudeSample(None, quaternion_of(body(t, strength))), k * S // 25)
-        if gimbal == "honest":
-            q = quaternion_of(body(t, strength) * mount)
-            history.add(GimbalSample(None, q, GimbalFrame.EARTH, 154, 0), k * S // 25)
-        elif gimbal == "wrong":
-            claimed = GimbalSample(None, quaternion_of(mount), GimbalFrame.EARTH, 154, 0)
-            history.add(claimed, k * S // 25)
-    return history
-
-
-def fly(
-    check: TelemetryCheck,
-    strength: float = 1.0,
-    noise_rad: float = 5e-4,
-    gap: bool = False,
-    hz: float = 15.0,
-    rate: float = 0.0,
-    image_roll_deg: float = 0.0,
-) -> list[int]:
-    """Forty seconds of frames whose stamps are 70 ms late, and ever later by ``rate``; the times of
-    exposure. The images are turned clockwise by ``image_roll_deg``."""
-    rng = np.random.default_rng(2)
-    mount = Rotation.from_euler("Y", -math.pi / 3)
-    R_head_camera = gimbal_from_camera(image_roll_deg)
-    exposed = []
-    for k in range(round(40 * hz)):
-        t = 1.0 + k / hz
-        noise = Rotation.from_rotvec(rng.normal(0.0, noise_rad, 3))
-        T = np.eye(4)
-        T[:3, :3] = (body(t, strength) * mount * noise).as_matrix() @ R_head_camera
-        stamp = round((t + LATE_S + rate * t) * S)
-        lost = gap and 200 <= k < 205
-        exposed.append(check.exposed_ns(stamp))
-        segment = int(gap and k >= 205)
-        state = Tracking.LOST if lost else Tracking.TRACKED
-        check.add(stamp, seen(state, None if lost else T, segment))
-    check.finish()
-    return exposed
 
 
 @pytest.mark.parametrize("gimbal", ["none", "honest"])
@@ -145,68 +71,6 @@ def test_a_flight_without_turns_leaves_its_clock_open() -> None:
     check = TelemetryCheck(CameraConfig(), history_of("none", 0.0))
     fly(check, 0.0, hz=2.0)
     assert not check.is_clock_sure
-
-
-@pytest.mark.parametrize(
-    ("set_ms", "strength", "off_ms"),
-    [
-        (-130.0, 1.0, 200.0),
-        (500.0, 1.0, -430.0),
-        (0.0, 1.0, None),
-        (-130.0, 0.0, None),
-    ],
-)
-@pytest.mark.slow
-def test_stamps_that_are_off_by_more_than_a_latency_show_a_clock(
-    set_ms: float, strength: float, off_ms: float | None
-) -> None:
-    check = TelemetryCheck(CameraConfig(latency_ms=set_ms), history_of("none", strength))
-    fly(check, strength)
-    found = check.clock_off_ms()
-    assert found == (None if off_ms is None else pytest.approx(off_ms, abs=10.0))
-
-
-@pytest.mark.slow
-def test_a_recording_whose_clock_gains_shows_its_rate() -> None:
-    history, rate = history_of("none", 1.0), 0.003
-    check = TelemetryCheck(CameraConfig(), history)
-    fly(check, rate=rate)
-    found = check.clock_rate()
-    assert found is not None and found == pytest.approx(rate, abs=3e-4)
-    assert check.clock_rate() is None  # until there are more frames
-    again = TelemetryCheck(CameraConfig(), history.at_rate(found, S))
-    fly(again, rate=rate)
-    assert again.latency is not None and again.clock_rate(has_ended=True) is None
-    assert again.latency.latency_ms == pytest.approx(1e3 * (LATE_S + rate), abs=5.0)
-
-
-def test_a_clock_that_the_whole_log_does_not_confirm_stays() -> None:
-    """Another turn of the flight may look like that of the images."""
-
-    class Longer(VehicleHistory):
-        """A log of which those of a minute fit the images, and the whole does not."""
-
-        def bodies(self, since_ns: int = 0, until_ns: float = math.inf) -> Turns:
-            turns = super().bodies(since_ns, until_ns)
-            return turns if until_ns < math.inf else [(t, turns[0][1]) for t, _ in turns]
-
-    check = TelemetryCheck(CameraConfig(latency_ms=-130.0), history_of("none", 1.0, kind=Longer))
-    fly(check)
-    assert check.latency is not None  # near by
-    assert TelemetryCheck(CameraConfig(), None).clock_off_ms(has_ended=True) is None
-    assert check.clock_off_ms() is None and check.clock_off_ms(has_ended=True) is None
-
-
-@pytest.mark.slow
-def test_a_search_that_found_nothing_is_repeated_with_all_frames(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    check = TelemetryCheck(CameraConfig(latency_ms=-130.0), history_of("none", 1.0))
-    fly(check)
-    with monkeypatch.context() as early:
-        early.setattr(LatencyWatch, "anywhere", lambda watch, attitudes: None)
-        assert check.clock_off_ms() is None
-    assert check.clock_off_ms(has_ended=True) == pytest.approx(200.0, abs=10.0)
 
 
 def test_stills_show_a_latency_too() -> None:
