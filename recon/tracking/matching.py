@@ -16,38 +16,8 @@ import numpy.typing as npt
 from numba import njit
 
 from recon.parallel import parallel_for
-from recon.small_matrices import solve_symmetric
 from recon.tracking import patch_search
 from recon.types import F32, F64, U8, Bool
-
-
-@njit(cache=True, nogil=True, fastmath=True)
-def affine_trend(uv: Any, moves: Any, first: Any, tolerance: float, trend: Any) -> None:
-    """Fill ``trend`` (3, 2): ``moves`` (N, 2) as 1, u / 1000, v / 1000 times it, robustly.
-    Reweighted from ``first`` (2,) with a tolerance that narrows from eightfold to itself."""
-    trend[:] = 0.0
-    trend[0, 0], trend[0, 1] = first[0], first[1]
-    row = np.empty(3)
-    for sharpness in (0.125, 0.25, 0.5, 1.0, 1.0):
-        H, g = np.zeros((3, 3)), np.zeros((3, 2))
-        for k in range(3):
-            H[k, k] = 1e-6
-        for p in range(uv.shape[0]):
-            row[0], row[1], row[2] = 1.0, uv[p, 0] / 1000, uv[p, 1] / 1000
-            du, dv = moves[p, 0], moves[p, 1]
-            for k in range(3):
-                du -= row[k] * trend[k, 0]
-                dv -= row[k] * trend[k, 1]
-            share = (du * du + dv * dv) * (sharpness / tolerance) ** 2
-            weight = 1.0 / ((1.0 + share) * (1.0 + share))
-            for k in range(3):
-                g[k, 0] += weight * row[k] * moves[p, 0]
-                g[k, 1] += weight * row[k] * moves[p, 1]
-                for m in range(3):
-                    H[k, m] += weight * row[k] * row[m]
-        solve_symmetric(H, g)
-        for k in range(3):
-            trend[k, 0], trend[k, 1] = g[k, 0], g[k, 1]
 
 
 @njit(inline="always", fastmath=True)
@@ -146,6 +116,7 @@ at most."""
 REFINE_ITERATIONS = 6
 """Gauss-Newton steps to the sub-pixel place, at most; a step below 0.02 px ends it."""
 
+UNIT_PX = 1e3  # of pixels in a trend over the image: so its normal matrix is well scaled
 FAR = 1e6  # px; stands for a prediction that is not a number
 
 
@@ -269,14 +240,18 @@ class Search:
 
 def consensus(uv: F64, moves: F64, good: Bool, tolerance_px: float) -> F64 | None:
     """(3, 2) how ``moves`` (N, 2) change over ``uv`` (N, 2), as a row of 1, u, v times it, seen by
-    most good points; else None."""
+    most good points; else None. The weights of the others fall off at a tolerance that narrows from
+    eightfold to itself."""
     if np.count_nonzero(good) < 12:
         return None
-    x, y = uv[good], moves[good]
-    trend = np.empty((3, 2))
-    affine_trend(x, y, np.median(y, axis=0), tolerance_px, trend)
-    trend[1:] /= 1000.0
-    agree = np.hypot(*(y - trend[0] - x @ trend[1:]).T) < 2 * tolerance_px
+    x, y = np.column_stack([np.ones(len(uv)), uv / UNIT_PX])[good], moves[good]
+    trend = np.vstack([np.median(y, axis=0), np.zeros((2, 2))])
+    for wider in (8.0, 4.0, 2.0, 1.0, 1.0):
+        square = np.sum((y - x @ trend) ** 2, axis=1) / (wider * tolerance_px) ** 2
+        weighted = x.T / (1.0 + square) ** 2
+        trend = np.linalg.solve(weighted @ x + 1e-6 * np.eye(3), weighted @ y)
+    agree = np.linalg.norm(y - x @ trend, axis=1) < 2 * tolerance_px
+    trend[1:] /= UNIT_PX
     return trend if np.count_nonzero(agree) >= max(12, 0.4 * len(y)) else None
 
 

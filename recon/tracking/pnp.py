@@ -12,12 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from recon import se3
-from recon.small_matrices import solve_symmetric
 from recon.tracking import robust_geometry
-from recon.tracking.bundle import compose, cost_of, linearise, se3_exp
+from recon.tracking.bundle import cost_of, linearise_all
 from recon.types import F64, Bool
 
 THRESHOLD_PX = 2.0
@@ -45,7 +43,8 @@ class PnpResult:
     inliers: Bool  # (N,)
 
 
-STEPS = 10  # maximum number of Gauss-Newton steps
+STEPS, SETTLED = 10, 1e-8
+"""Gauss-Newton steps, at most; one that lowers the squared error by less, in px^2, ends them."""
 
 
 def solve(
@@ -106,49 +105,31 @@ def _errors(T: F64, points: F64, uv: F64, k: F64) -> F64:
     return error
 
 
-@njit(cache=True, nogil=True)
-def _normal_equations(
-    T: F64, points: F64, uv: F64, k: F64, used: Bool
-) -> tuple[F64, F64]:  # pragma: no cover - compiled
-    """(6, 6) matrix and (6,) right side of the reprojection errors of the points ``used`` (N,)."""
-    H, g = np.zeros((6, 6)), np.zeros(6)
-    Jc, Jp, r = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
-    for m in range(len(points)):
-        if not used[m] or linearise(T, points[m], uv[m], k, np.inf, Jc, Jp, r) == 0.0:
-            continue
-        for i in range(6):
-            g[i] -= Jc[0, i] * r[0] + Jc[1, i] * r[1]
-            for j in range(6):
-                H[i, j] += Jc[0, i] * Jc[0, j] + Jc[1, i] * Jc[1, j]
-    return H, g
+def _normal_equations(T: F64, points: F64, uv: F64, k: F64) -> tuple[F64, F64]:
+    """(6, 6) matrix and (6,) right side of the reprojection errors of points at a pose (4, 4)."""
+    each = np.arange(len(points))
+    by_pose, by_point = np.zeros((len(points), 2, 6)), np.zeros((len(points), 2, 3))
+    error, weight = np.zeros((len(points), 2)), np.zeros(len(points))
+    linearise_all(
+        T[None], points, np.zeros_like(each), each, uv, k, np.inf, by_pose, by_point, error, weight
+    )
+    in_front = weight > 0.0
+    J = by_pose[in_front].reshape(-1, 6)
+    return J.T @ J, -J.T @ error[in_front].ravel()
 
 
-@njit(cache=True, nogil=True)
-def _descend(
-    T: F64, points: F64, uv: F64, k: F64, used: Bool
-) -> tuple[F64, bool]:  # pragma: no cover - compiled
-    """Pose (4, 4) at the least squared error of the points ``used``; False where it is open."""
-    step, moved, here = np.empty((4, 4)), np.empty((6, 1)), T.copy()
+def _descended(T: F64, points: F64, uv: F64, k: F64) -> F64 | None:
+    """The pose (4, 4) of the least squared error, from ``T`` on; None where it is open."""
     for _ in range(STEPS):
-        H, g = _normal_equations(here, points, uv, k, used)
-        scale = np.empty(6)
-        for i in range(6):
-            scale[i] = np.sqrt(H[i, i])
-            if not (scale[i] > 0 and scale[i] < np.inf):
-                return here, False
-        for i in range(6):
-            moved[i, 0] = g[i] / scale[i]
-            for j in range(6):
-                H[i, j] /= scale[i] * scale[j]
-            H[i, i] += 1e-12
-        if not solve_symmetric(H, moved):
-            return here, False
-        se3_exp(moved[:, 0] / scale, step)
-        before = here.copy()
-        compose(step, before, here)
-        if np.abs(moved).max() < 1e-7:
+        H, g = _normal_equations(T, points, uv, k)
+        try:
+            step = np.asarray(np.linalg.solve(H, g), np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        T = se3.exp(step) @ T
+        if step @ g < SETTLED:
             break
-    return here, True
+    return T if np.isfinite(T).all() else None
 
 
 def _best(
@@ -167,8 +148,8 @@ def _best(
         used = _errors(best, points, uv, k) <= gate * threshold_px
         if np.count_nonzero(used) < min_inliers:
             return None
-        best, is_closed = _descend(best, points, uv, k, used)
-        if not is_closed or not np.isfinite(best).all():
+        best = _descended(best, points[used], uv[used], k)
+        if best is None:
             return None
     return best
 
@@ -187,7 +168,7 @@ def _judge(
             return None
     error = error[inliers]
     variance = max(float(error @ error) / (2 * count - 6), FLOOR_PX**2)
-    H, _ = _normal_equations(T, points, uv, k, inliers)
+    H, _ = _normal_equations(T, points[inliers], uv[inliers], k)
     covariance = _inverse(H)
     if covariance is None:
         return None
