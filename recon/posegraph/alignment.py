@@ -23,7 +23,7 @@ from recon.posegraph.alignment_readings import (
     AlignmentReadings,
     ReadingNoise,
 )
-from recon.posegraph.ground import ASSUMED_TILT_RAD, GUESSED_SHARE, INDEPENDENT_HEIGHTS
+from recon.posegraph.ground import ASSUMED_TILT_RAD, GUESSED_SHARE
 from recon.posegraph.pose_priors import has_fix
 from recon.posegraph.records import SIGMA_STEP, Node
 from recon.posegraph.sensor_noise import (
@@ -39,7 +39,7 @@ from recon.posegraph.sensor_noise import (
     gauss_markov_noise,
 )
 from recon.similarity import umeyama
-from recon.types import F64
+from recon.types import F64, PosePrior
 
 HUBER = 2.5
 """Whitened residuals beyond this lose weight: of three axes together, noise alone reaches it once
@@ -54,6 +54,9 @@ SETTLED = 1e-3  # sigmas; a shorter step ends the fit: each is about half the on
 SETTLED_START = 0.1  # the same for a fit that starts another one, or whose residuals give the noise
 ITERATIONS = 30  # steps of a fit, at most
 ROUNDS = 4  # times that the noise of altitudes and the tilt by them are found in turn
+SIGMA_MOUNT_RAD = np.radians(2.0)  # how well a camera is aligned before anything is known
+MIN_ATTITUDES = 8  # of a segment that shows a boresight
+STRANGE = 5.0  # sigmas of a tilt, median, beyond which attitudes and images do not belong together
 MIN_WALK = 0.02  # sigma that no integrated velocity is better than, m / sqrt(s)
 
 
@@ -96,7 +99,7 @@ def fit(
         else:
             covariance[6, 6] = max(covariance[6, 6], GUESSED_SHARE**2)
     heights = None
-    if len(readings.fix) and noise.horizontal is not None:
+    if len(readings.fix) and noise.fixes is not None:
         heights = readings.heights(best.at, best.H, covariance)
     covariance[6, 6] += SIGMA_STEP**2 / max(len(usable) - 1, 1)
     mean = counted = None
@@ -117,6 +120,35 @@ def fit(
     lean[:2, :2] = covariance[:2, :2] + np.outer(off, off)
     centre = similarity.points(readings.x.mean(axis=0))
     return replace(similarity, lean=se3.about(-centre, lean))
+
+
+def boresight(nodes: Sequence[Node]) -> tuple[F64, F64]:
+    """How reported attitudes are turned against the camera, in its frame: the (3,) right side and
+    (3, 3) matrix of its normal equations, zero where attitudes and images do not belong together.
+
+    The attitudes are those of a mount that is known to :data:`SIGMA_MOUNT_RAD`, with nothing else
+    to go by: only turns separate it from the lean of the map, as in hand-eye calibration (Park and
+    Martin 1994, doi:10.1109/70.326576). About the vertical they stay one as long as the camera only
+    turns about it.
+    """
+    nothing = np.zeros(3), np.zeros((3, 3))
+    seen = [
+        replace(a, height=None, prior=PosePrior(p.R_world_camera, p.sigma_tilt_rad,
+                                                p.sigma_yaw_rad, is_view_assumed=True))
+        for a in nodes
+        if (p := a.prior).R_world_camera is not None and not p.is_view_assumed
+    ]  # fmt: skip
+    if len(seen) < MIN_ATTITUDES:
+        return nothing
+    readings = AlignmentReadings(seen, None, SIGMA_MOUNT_RAD)
+    found = _solve(readings, _starts(seen, readings)[0], SETTLED_START)
+    tilts = np.linalg.norm(readings.attitude_residuals(found.at)[0][:, :2], axis=1)
+    if float(np.median(tilts / [a.prior.sigma_tilt_rad for a in seen])) > STRANGE:
+        return nothing
+    turn, matrix = found.at.mount_rad, np.linalg.inv(np.linalg.inv(found.H)[7:10, 7:10])
+    sigmas = float(np.linalg.norm(turn)) / SIGMA_MOUNT_RAD
+    weight = min(1.0, HUBER / max(sigmas, 1e-9))  # of what was known before
+    return matrix @ turn, matrix - weight * np.eye(3) * SIGMA_MOUNT_RAD**-2
 
 
 def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
@@ -184,10 +216,10 @@ def _of_fixes(fixes: AlignmentReadings, at: Alignment, slow_share: float) -> Rea
     reach = horizontal.reach(sigma_h, min(least, slow_share))
     most, drift = horizontal.reach(sigma_h, slow_share), sigma_v if is_claimed else abs(at.drift_m)
     tau_h_s, tau_v_s = bias_time_constant_s(most), bias_time_constant_s(sigma_v)
+    bounded_h = horizontal.bounded(most, tau_h_s, MIN_BIAS * most)
     bounded_v = vertical.bounded(sigma_v, tau_v_s, MIN_BIAS * drift)
     return ReadingNoise(
-        horizontal=horizontal.bounded(most, tau_h_s, MIN_BIAS * most),
-        vertical=bounded_v,
+        fixes=(bounded_h, bounded_h, bounded_v),
         off_track=(
             off_h.drifting(most, tau_h_s, span_s),
             off_v.drifting(sigma_v, tau_v_s, span_s) if is_claimed else bounded_v,
@@ -220,17 +252,9 @@ def scales(nodes: Sequence[Node], at: Alignment) -> tuple[Scale | None, Scale | 
     r = AlignmentReadings(nodes)
     by_fixes = by_heights = None
     if len(r.fix) >= 4:
-        x, y = r.x @ at.R.T, r.fix
-        near = np.abs(at.scale * x + at.t - y) < 5.0 * r.claimed
-        w = (near.all(axis=1)[:, None]) / r.claimed**2
-        total = np.maximum(np.sum(w, axis=0), 1e-30)
-        x, y = (v - np.sum(w * v, axis=0) / total for v in (x, y))
-        power = float(np.sum(w * x**2))
-        if power > 0:
-            scale = float(np.sum(w * x * y)) / power
-            # Errors of fixes wander slowly: all of them together count as a few.
-            sigma = np.sqrt(max(len(x) / INDEPENDENT_HEIGHTS, 1.0) / power) / max(scale, 1e-9)
-            by_fixes = (scale, float(sigma)) if scale > 0 else None
+        alone = [replace(a, height=None, prior=replace(a.prior, travel=None)) for a in nodes]
+        found = _solve(AlignmentReadings(alone), at, SETTLED_START)
+        by_fixes = found.at.scale, float(np.sqrt(np.linalg.inv(found.H)[6, 6]))
     if r.has_measured_heights:
         spread = 1.0 / float(np.sqrt(np.sum(1.0 / r.sigma_log**2)))
         by_heights = float(np.exp(np.median(r.log_ratio))), spread
@@ -305,11 +329,9 @@ def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[Alignmen
 
 
 def _sources(readings: AlignmentReadings) -> tuple[str, ...]:
-    out = []
-    if readings.heading_known.any():
-        out.append("attitude")
-    if readings.has_heights:
-        out.append("altitude")
-    if len(readings.fix):
-        out.append("gnss")
-    return tuple(out)
+    known = {
+        "attitude": readings.heading_known.any(),
+        "altitude": readings.has_heights,
+        "gnss": len(readings.fix) > 0,
+    }
+    return tuple(name for name, is_known in known.items() if is_known)

@@ -43,9 +43,8 @@ its time in s, and the drift in m/s that they may have, 0 where they state their
 class ReadingNoise:
     """How fixes and velocities err along one flight, 1 sigma per axis."""
 
-    horizontal: Noise | None = None  # of a fix, m; None: as it claims
-    vertical: Noise | None = None
-    off_track: tuple[Noise, Noise] | None = None  # of both off vision's track, which drifts too
+    fixes: tuple[Noise, Noise, Noise] | None = None  # of a fix, m, by axis; None: as it claims
+    off_track: tuple[Noise, Noise] | None = None  # off vision's track, which drifts too; h and v
     reach_m: F64 | None = None  # (3,) how far fixes may wander
     tilt: Noise | None = None  # of an assumed view about its mount, rad
     claimed: F64 | None = None  # (3,) m as the fixes claim it
@@ -53,13 +52,6 @@ class ReadingNoise:
     fresh_share: F64 = field(default_factory=lambda: np.ones(3))  # of fixes, by their correlation
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
     rate_m_s: float = USUAL_RATE_M_S  # of the velocity, which errs so for RATE_S
-
-    @property
-    def by_axis(self) -> tuple[Noise, Noise, Noise] | None:
-        """Of a fix along each axis; None where it errs as it claims."""
-        if self.horizontal is None or self.vertical is None:
-            return None
-        return self.horizontal, self.horizontal, self.vertical
 
     def of_fixes(self, claimed: F64) -> tuple[F64, tuple[Noise, Noise]]:
         """(m, 3) sigma of a fix alone, and how such errors, in units of it, go along the track:
@@ -75,7 +67,7 @@ class ReadingNoise:
     def or_else(self, usual: ReadingNoise | None, claimed: F64) -> ReadingNoise:
         """The same with the ``usual`` noise of fixes that claim as much, (m, 3), if their own is
         not known."""
-        if self.horizontal is not None or usual is None or usual.claimed is None:
+        if self.fixes is not None or usual is None or usual.claimed is None:
             return self
         if not len(claimed) or np.any(np.abs(np.log(np.median(claimed, 0) / usual.claimed)) > 0.5):
             return self
@@ -94,11 +86,11 @@ class ReadingNoise:
         """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
         the readings in a graph count for it."""
         usual, count, span_s = np.median(claimed, axis=0), len(claimed), float(np.ptp(times_s))
-        if (known := self.by_axis) is None or self.reach_m is None:
+        if self.fixes is None or self.reach_m is None:
             return usual, usual / np.sqrt(1.0 + span_s / (2.0 * FIX_S))
-        far = zip(known, self.reach_m, count * self.fresh_share, strict=True)
+        far = zip(self.fixes, self.reach_m, count * self.fresh_share, strict=True)
         mean = [one.of_mean(float(m), float(n), span_s) for one, m, n in far]
-        counted = [one.effective_sigma(count, span_s) / count**0.5 for one in known]
+        counted = [one.effective_sigma(count, span_s) / count**0.5 for one in self.fixes]
         return np.array(mean), np.array(counted)
 
     def of_travels(self, seconds: F64) -> F64:
@@ -145,7 +137,13 @@ class Alignment(Similarity):
 class AlignmentReadings:
     """The nodes' readings as arrays, by kind; rows of one reading form a group."""
 
-    def __init__(self, nodes: Sequence[Node], noise: ReadingNoise | None = None) -> None:
+    def __init__(
+        self,
+        nodes: Sequence[Node],
+        noise: ReadingNoise | None = None,
+        sigma_mount_rad: float | None = None,
+    ) -> None:
+        """``sigma_mount_rad`` is that of the mount of assumed views; None: as they state it."""
         turned = [a for a in nodes if a.prior.R_world_camera is not None]
         fixed = [a for a in nodes if has_fix(a.prior)]
         moved = [(a, b, w) for a, b in pairwise(nodes) if (w := _travelled(a.prior, b.prior))]
@@ -193,7 +191,7 @@ class AlignmentReadings:
         travel = np.repeat(1.0 / (self.sigma_speed * self.travel_s), 3)
         self._whitening = np.concatenate(
             [known.ravel(), 1.0 / self.sigma_fix.ravel(), travel, 1.0 / self.sigma_log,
-             1.0 / self._sigma_common(turned)]
+             1.0 / self._sigma_common(turned, sigma_mount_rad)]
         )  # fmt: skip
         self.of_fixes = slice(len(turned), len(turned) + len(fixed))
         """Groups of the fixes."""
@@ -210,11 +208,11 @@ class AlignmentReadings:
         self._J[3 * three : -4, 6] = 1.0
         self._J[-4:, 7:] = np.eye(4)
 
-    def _sigma_common(self, turned: Sequence[Node]) -> F64:
+    def _sigma_common(self, turned: Sequence[Node], sigma_mount_rad: float | None) -> F64:
         """(4,) of the assumed mount and of the altitudes' drift; next to none where there is
         neither."""
         tilts = [a.prior.sigma_tilt_rad for a in turned if a.prior.is_view_assumed]
-        mount = float(np.median(tilts)) if tilts else TINY
+        mount = sigma_mount_rad or (float(np.median(tilts)) if tilts else TINY)
         drift = TINY if self.is_height_claimed else float(np.median(self.claimed[:, 2]))
         return np.array([mount] * 3 + [drift])
 
@@ -318,8 +316,10 @@ class AlignmentReadings:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         seen, R_prior = at.R @ self.R_odom, self.R_prior.copy()
         R_prior[self.is_assumed] = R_prior[self.is_assumed] @ se3.so3_exp(at.mount_rad)
-        of_up = (seen @ se3.hat(R_prior[:, 2])) * self.is_assumed[:, None, None]
-        of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
+        of_up = seen @ se3.hat(R_prior[:, 2])
+        of_tilt = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
+        of_mount = np.where(self.heading_known[:, None, None], -seen, of_tilt)
+        of_mount *= self.is_assumed[:, None, None]
         return off_attitudes(seen, R_prior, self.heading_known), of_mount
 
     def over_claim(self, residuals: F64, scale: float, white: Sequence[float]) -> F64:

@@ -6,19 +6,24 @@ A motion is vision's, or telemetry's where vision has none. docs/pose-graph.md l
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix, off_attitudes
 from recon.posegraph.records import FRAME_DRIFT, SIGMA_STEP, Loop, Node
 from recon.posegraph.segments import Segments
-from recon.posegraph.sensor_noise import ALTITUDE_S, ATTITUDE_S, bias_time_constant_s, inflation
+from recon.posegraph.sensor_noise import (
+    ALTITUDE_S,
+    ATTITUDE_S,
+    Noise,
+    bias_time_constant_s,
+    inflation,
+)
 from recon.posegraph.sensor_offsets import FRAME_SIGMA_RAD, GATE_SIGMAS
 from recon.posegraph.smoother import NO_SCALE, Smoother
 from recon.types import F64, PosePrior
@@ -134,10 +139,10 @@ class GraphFactors:
     ) -> tuple[F64, F64, bool]:
         """T_last_node in metres, its (6, 6) covariance, left, in last's frame, and whether vision
         gives it; now a factor. ``before`` is the last node's corrected prior."""
-        is_seen, scale, unit = node.segment == last.segment, NO_SCALE, NO_SCALE
+        keys, is_seen = (last.key, node.key), node.segment == last.segment
         if is_seen:
             motion, covariance = self._seen(node, last)
-            noise = self._segments[node.segment].noise
+            noise = self._segments[node.segment].fix_noise
             passed_s = (node.time_ns - last.time_ns) * 1e-9
             if noise is not None and _is_refuted(
                 before, self._prior, passed_s, motion, covariance, noise
@@ -149,10 +154,10 @@ class GraphFactors:
             self.left_out["stretch without vision"] += 1
         if is_seen:
             scale, unit = self.scale_of[node.key], self._units.get(node.segment, NO_SCALE)
+            self.smoother.add_motion("vision", keys, motion, covariance, scale, unit)
         else:
             motion, covariance = self._link(node, last, T_last)
-        kind = "vision" if is_seen else "link"
-        self.smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale, unit)
+            self.smoother.add_motion("link", keys, motion, covariance)
         return motion, covariance, is_seen
 
     def _scale(self, node: Node, last: Node | None) -> int:
@@ -248,7 +253,7 @@ class GraphFactors:
         return True
 
     def _position(self, node: Node, T: F64, spread: F64) -> bool:
-        prior, noise = node.prior, self._segments[node.segment].noise
+        prior, noise = node.prior, self._segments[node.segment].fix_noise
         if prior.position_m is None or prior.sigma_position_m is None:
             return False
         sigma = np.maximum(prior.sigma_position_m, MIN_FIX_M)
@@ -259,8 +264,8 @@ class GraphFactors:
         if np.any(apart > GATE_SIGMAS * np.sqrt(sure + sigma**2)):
             self.left_out["position off"] += 1
             return False
-        if noise is not None and (known := noise.by_axis):
-            each = [one.effective_sigma(self._keyframes, self._span_s) for one in known]
+        if noise is not None:
+            each = [one.effective_sigma(self._keyframes, self._span_s) for one in noise]
             sigma = np.maximum(each, MIN_FIX_M)
         else:
             sigma = sigma * self._inflation(bias_time_constant_s(float(sigma[0])))
@@ -312,22 +317,22 @@ def _length_sigma(node: Node, last: Node) -> float:
 
 
 def _is_refuted(
-    a: PosePrior, b: PosePrior, passed_s: float, motion: F64, covariance: F64, noise: ReadingNoise
-) -> bool:
+    a: PosePrior, b: PosePrior, passed_s: float, motion: F64, covariance: F64,
+    noise: Sequence[Noise],
+) -> bool:  # fmt: skip
     """True where both known attitudes and positions contradict vision's ``motion`` (4, 4) from a to
-    b: two sensors do not fail at once by chance, and images that smear do."""
+    b: two sensors do not fail at once by chance, and images that smear do. ``noise`` is that of
+    positions, by axis."""
     R_a, R_b, from_m, to_m = a.R_world_camera, b.R_world_camera, a.position_m, b.position_m
     are_assumed = a.is_view_assumed or b.is_view_assumed
     if R_a is None or R_b is None or are_assumed or not (has_fix(a) and has_fix(b)):
         return False
     assert from_m is not None and to_m is not None
-    if (known := noise.by_axis) is None:
-        return False
     up = R_a @ motion[:3, :3] @ R_b[2]  # where that of b points
     sigma_rad = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0 + b.sigma_tilt_rad**2))
     if not np.hypot(up[0], up[1]) > GATE_SIGMAS * sigma_rad:
         return False
-    changed = np.square([one.change(passed_s) for one in known])
+    changed = np.square([one.change(passed_s) for one in noise])
     sigma_m = np.sqrt(changed + np.trace(covariance[3:, 3:]) / 3.0)
     off_m = np.abs(R_a @ motion[:3, 3] - (to_m - from_m))
     return bool(np.any(off_m > GATE_SIGMAS * sigma_m))

@@ -14,6 +14,7 @@ from recon.posegraph.alignment import Scale
 from recon.posegraph.alignment_readings import Alignment, ReadingNoise
 from recon.posegraph.ground import GUESSED_SHARE, guessed_at
 from recon.posegraph.records import Loop, Node
+from recon.posegraph.sensor_noise import Noise
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.types import F64, PosePrior
 
@@ -45,6 +46,7 @@ class Segment:
     similarity: Alignment | None = None  # once telemetry or a loop gives it
     constants: Constants = field(default_factory=Constants)  # errors it was fitted with
     offsets: Offsets | None = None  # of its sensors from the similarity
+    boresight: tuple[F64, F64] | None = None  # normal equations of what it shows of that
     is_tied_by_loop: bool = False
     fitted: int = 0  # keyframes when the similarity was fitted last
     surface: list[int] = field(default_factory=list)  # its keyframes with depth
@@ -78,9 +80,10 @@ class Segment:
         return Alignment(1.0, turn, np.zeros(3))
 
     @property
-    def noise(self) -> ReadingNoise | None:
-        """How its fixes err; None before they were fitted."""
-        return None if self.similarity is None else self.similarity.noise
+    def fix_noise(self) -> tuple[Noise, Noise, Noise] | None:
+        """How its fixes err, by axis; None where that is not measured."""
+        noise = self.to_world.noise
+        return None if noise is None else noise.fixes
 
     @property
     def rests_on_fixes(self) -> bool:
@@ -173,9 +176,9 @@ class Segments:
 
     def _usual_noise(self) -> ReadingNoise | None:
         """That of the fixes of the largest segment which shows it."""
-        known = [s for s, found in self._placed() if found.noise and found.noise.horizontal]
+        known = [segment for segment, _ in self._placed() if segment.fix_noise]
         largest = max(known, key=lambda segment: segment.keyframes, default=None)
-        return None if largest is None else largest.noise
+        return None if largest is None else largest.to_world.noise
 
     def sigma_height_m(self, number: int) -> float:
         """Sigma of a segment's height against the largest one of known heights: what all fixes of
@@ -262,7 +265,7 @@ class Segments:
         if segment.keyframes < due:
             return False
         segment.fitted = segment.keyframes
-        fresh = self._newest_constants()
+        fresh = self._newest_constants(segment)
         readings = self._without_constants(segment, fresh)
         found = alignment.fit(readings, fresh.slow_share, self._usual_noise())
         if found is None:
@@ -281,15 +284,13 @@ class Segments:
         segment.offsets = offsets(readings, found)
         return True
 
-    def _newest_constants(self) -> Constants:
-        """By all segments: the sensors stay the same."""
-        nodes = [node for segment in self for node in segment.nodes]
+    def _newest_constants(self, segment: Segment) -> Constants:
+        """By all segments, of which this one has grown: the sensors stay the same."""
+        segment.boresight = alignment.boresight(segment.nodes)
+        nodes = [node for one in self for node in one.nodes]
         span_s = (nodes[-1].time_ns - nodes[0].time_ns) * 1e-9
-        stretches = [
-            ([n.T_odom_camera for n in segment.nodes], [n.prior for n in segment.nodes])
-            for segment in self
-        ]
-        return constants(stretches, span_s)
+        shown = [one.boresight for one in self if one.boresight]
+        return constants([node.prior for node in nodes], span_s, shown)
 
     def altitude_offset(self) -> float | None:
         """Altitude less world z over the keyframes that fixes place, else over those of the first

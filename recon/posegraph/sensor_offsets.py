@@ -11,22 +11,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from recon import parallel, se3
-from recon.posegraph.alignment import HUBER
+from recon import se3
+from recon.posegraph.alignment import SIGMA_MOUNT_RAD
 from recon.posegraph.alignment_readings import Alignment, from_middle
 from recon.posegraph.ground import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import off_attitudes
 from recon.posegraph.records import Node
-from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
+from recon.posegraph.sensor_noise import FIX_S
 from recon.similarity import lever
 from recon.types import F64, PosePrior
 
-SIGMA_RAD = np.radians(2.0)  # how well a camera is aligned before anything is known
 BOUND_RAD = np.radians(15.0)  # a larger angle is not a boresight but another fault
-MIN_ATTITUDES = 8  # minimum number of attitudes of a stretch
-WILD = 5.0  # median whitened residual beyond which attitudes and images do not belong together
 SURE = 9.0  # squared sigmas by which a boresight must differ from none to be applied
-ROUNDS = 6  # Gauss-Newton steps, each with new robust weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +31,7 @@ class Constants:
     R_reported @ exp(turn)``. The altitudes' datum: ``up_m`` is to be added to them."""
 
     turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, in the camera's frame
-    sigma_turn: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
+    sigma_turn: F64 = field(default_factory=lambda: np.full(3, SIGMA_MOUNT_RAD))
     up_m: float = 0.0
     sigma_up_m: float = float("inf")  # of what is then left of the constant
     slow_share: float = 1.0  # of the receiver's variance; the rest is new in each fix
@@ -84,73 +80,6 @@ class Offsets:
             is_relief = self.is_exact and slant > 0.0
             agl = None if is_relief else agl * float(np.exp(self.log_height))
         return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
-
-
-Turns = tuple[F64, F64, F64]
-"""Of one segment the camera's rotations (N, 3, 3), those by telemetry, world from camera, and their
-sigmas (N, 3) rad about the world's axes; a heading over 1 rad is not known."""
-
-
-def turns_of(poses: Sequence[F64], priors: Sequence[PosePrior]) -> Turns | None:
-    """Of poses (4, 4) in one frame and their priors; None of too few attitudes."""
-    rows = [
-        (T[:3, :3], p.R_world_camera, (p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad))
-        for T, p in zip(poses, priors, strict=True)
-        if p.R_world_camera is not None and not p.is_view_assumed
-    ]
-    if len(rows) < MIN_ATTITUDES:
-        return None
-    odom, reported, sigma = (np.array(c, np.float64) for c in zip(*rows, strict=True))
-    return odom, reported, sigma
-
-
-def boresight(stretches: Sequence[Turns], span_s: float) -> Constants:
-    """The boresight by all stretches of a flight of ``span_s``; small where turns are missing.
-
-    Vision and telemetry differ by one rotation in the world (the odometry's frame) and one in the
-    camera (the boresight); turns separate them, as in hand-eye calibration (Park and Martin 1994,
-    doi:10.1109/70.326576). About the vertical they stay one as long as the camera only turns about
-    it: a boresight in heading is then a compass error, which the track of the fixes takes out.
-
-    Attitudes err together over :data:`ATTITUDE_S`, so all of them count as
-    1 + span / (2 ATTITUDE_S) readings.
-    """
-    if not stretches:
-        return Constants()
-    R_odom, R_reported, sigma = (np.concatenate(c) for c in zip(*stretches, strict=True))
-    counts = [len(R) for R, *_ in stretches]
-    of, first = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts[:-1]])
-    share = min(1.0, (1.0 + span_s / (2.0 * ATTITUDE_S)) / len(of))
-    each = np.add.reduceat(R_reported @ R_odom.transpose(0, 2, 1), first)
-    frames = np.array([se3.nearest_rotation(mean) for mean in each])
-    turn, known = np.zeros(3), np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
-    usual = np.full(3, SIGMA_RAD)
-    for _ in range(ROUNDS):
-        parallel.release_gil()
-        Q = R_reported @ se3.so3_exp(turn)
-        r = se3.each_so3_log(frames[of] @ R_odom @ Q.transpose(0, 2, 1))
-        norms = np.sqrt(np.sum(known * r**2, axis=1))
-        info = share * known * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))[:, None]
-        # r + w - Q b, with the turns w of the frames eliminated, each by its own 3 x 3 block: a
-        # flight may come in hundreds of stretches.
-        A_ww, g_w = np.add.reduceat(info, first) + 1e-9, -np.add.reduceat(info * r, first)
-        A_wb = -np.add.reduceat(info[:, :, None] * Q, first)
-        gain = A_wb.transpose(0, 2, 1) / A_ww[:, None]
-        H = np.diag(usual**-2) + np.einsum("nki,nk,nkj->ij", Q, info, Q)
-        H = H - np.sum(gain @ A_wb, axis=0)
-        g = np.einsum("nki,nk->i", Q, info * r) - np.einsum("fij,fj->i", gain, g_w)
-        step = np.linalg.solve(H, g - turn * usual**-2)
-        w = (g_w - A_wb @ step) / A_ww
-        frames = se3.each_so3_exp(w) @ frames
-        turn = turn + step
-        # Only a turn that is sure in spite of what is usual refutes that.
-        refuted = turn**2 > SURE * np.diag(np.linalg.inv(H))
-        usual = np.where(refuted, np.maximum(usual, np.abs(turn)), usual)
-        if max(np.abs(step).max(), np.abs(w).max()) < 1e-6:
-            break
-    if float(np.median(norms)) > WILD or float(np.linalg.norm(turn)) > BOUND_RAD:
-        return Constants()
-    return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))))
 
 
 MIN_INTERVALS = 3  # minimum number of intervals between keyframes with fixes
@@ -224,14 +153,16 @@ NEAR_SIGMAS = 5.0  # fixes further from the track, attitudes from their median, 
 
 
 def constants(
-    stretches: Sequence[tuple[Sequence[F64], Sequence[PosePrior]]], span_s: float
+    priors: Sequence[PosePrior], span_s: float, boresights: Sequence[tuple[F64, F64]]
 ) -> Constants:
-    """Those of a flight of ``span_s`` from poses (4, 4) and priors, segment by segment."""
-    turns = [t for poses, priors in stretches if (t := turns_of(poses, priors)) is not None]
-    every = [prior for _, priors in stretches for prior in priors]
-    turned = boresight(turns, span_s)
-    datum = altitude_datum(every, span_s)
-    return replace(datum, turn=turned.turn, sigma_turn=turned.sigma_turn)
+    """Those of a flight of ``span_s`` by its priors, and by what segments show of the boresight
+    (:func:`recon.posegraph.alignment.boresight`)."""
+    datum = altitude_datum(priors, span_s)
+    H = np.eye(3) * SIGMA_MOUNT_RAD**-2 + sum(matrix for _, matrix in boresights)
+    turn = np.linalg.solve(H, sum((side for side, _ in boresights), np.zeros(3)))
+    if float(np.linalg.norm(turn)) > BOUND_RAD:
+        return datum
+    return replace(datum, turn=turn, sigma_turn=np.sqrt(np.diag(np.linalg.inv(H))))
 
 
 def offsets(nodes: Sequence[Node], at: Alignment) -> Offsets:

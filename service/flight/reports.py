@@ -118,7 +118,7 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
     step = max(1, -(-len(graph.loops) // MAX_LOOPS))
     accepted = [loop.scaled(graph.scale(loop.a)) for loop in graph.loops[::step]]
     largest = graph.segments.largest()
-    noise = None if largest is None else largest.noise
+    noise = None if largest is None else largest.to_world.noise
     pairs = [
         [*loop.ends, taken]
         for loops, taken in ((graph.loops, True), (graph.pending, False))

@@ -20,7 +20,8 @@ import numpy as np
 
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.parallel import run_parallel
-from recon.posegraph.records import Loop
+from recon.posegraph.alignment import boresight
+from recon.posegraph.records import Loop, Node
 from recon.posegraph.sensor_offsets import constants
 from recon.survey.ground_control import (
     SIGMA_SCALE,
@@ -425,7 +426,13 @@ class _Refinement:
             self.notes.append(f"{path.name} gives no position of any keyframe: not used")
             return []
         priors = [PosePrior() if s is None else rig.prior(s, None) for s in states]
-        known = constants([(list(self.states.poses), priors)], (times[-1] - times[0]) * 1e-9)
+        nodes = [
+            Node(k, time_ns, 0, T, np.zeros((6, 6)), prior)
+            for k, (time_ns, T, prior) in enumerate(
+                zip(times, self.states.poses, priors, strict=True)
+            )
+        ]
+        known = constants(priors, (times[-1] - times[0]) * 1e-9, [boresight(nodes)])
         return [known.without(prior) for prior in priors]
 
     # ---- loops -------------------------------------------------------------------------------

@@ -348,7 +348,7 @@ def test_the_track_lies_in_the_mean_of_fixes_that_wander() -> None:
         prior = replace(a.prior, position_m=fixes[-1], sigma_position_m=np.full(3, 2.0))
         some.append(replace(a, prior=prior))
     found = fit(some)
-    assert found is not None and found.noise is not None and found.noise.horizontal is not None
-    assert found.noise.horizontal.bias > 2.0 * found.noise.horizontal.white
+    assert found is not None and found.noise is not None and found.noise.fixes is not None
+    assert found.noise.fixes[0].bias > 2.0 * found.noise.fixes[0].white
     middle = found.points(np.mean([a.place_of_fix for a in some], axis=0))
     np.testing.assert_allclose(middle, np.mean(fixes, axis=0), atol=0.05)

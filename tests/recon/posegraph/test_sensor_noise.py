@@ -248,12 +248,16 @@ def test_a_compass_that_is_off_is_no_drift_of_the_velocity() -> None:
     assert abs(np.degrees(se3.so3_log(found.R)[2])) < 0.5
 
 
-def test_velocities_that_contradict_the_fixes_are_left_out() -> None:
-    standing = [
-        replace(a, prior=replace(a.prior, travel=Travel(np.zeros(3), float(i), 1)))
-        for i, a in enumerate(drifting_nodes(1.0, 1.0))
-    ]
-    found = fit(standing)
+@pytest.mark.parametrize("share", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("claimed_m", [1.0, 2.0])
+def test_velocities_that_contradict_the_fixes_are_left_out(share: float, claimed_m: float) -> None:
+    """As of a vehicle that stands, or in another unit; most of all readings would agree on them."""
+    wrong = []
+    for a in drifting_nodes(1.0, claimed_m):
+        assert a.prior.travel is not None
+        travel = replace(a.prior.travel, metres=share * a.prior.travel.metres)
+        wrong.append(replace(a, prior=replace(a.prior, travel=travel)))
+    found = fit(wrong)
     assert found is not None
     assert found.scale == pytest.approx(1.5, rel=0.002)
 
