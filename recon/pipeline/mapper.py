@@ -18,6 +18,7 @@ import numpy as np
 from recon.backends import Backend
 from recon.backends.cpu import CpuBackend
 from recon.calibration.adjusted_track import AdjustedTrack
+from recon.calibration.focal_watch import FocalWatch
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.mapping.voxel_map import VoxelMap, ground_sample_m
@@ -171,11 +172,13 @@ class Mapper:
         self._timing = timing
         self._size_px, self._last = camera.size_px, (-1, -(1 << 63))  # number and time of a frame
         self.undistort = Undistort(camera, config.guide_width_px, timing)
+        self.focal = FocalWatch(self.undistort.tracking_camera.K)
         self.odometry = known or Odometry(
             self.undistort.tracking_camera,
             camera,
             config.seeks_readout,
             config.base_to_height,
+            self.focal.add,
         )
         selection = ViewSelection(config.spacing, config.pairs, all_known=known is not None)
         self._waiting = Counter[str]()  # frames since a segment's first one, by reason

@@ -75,9 +75,12 @@ def observations(
     return ids, index.astype(np.int64), np.concatenate(cam)[use], np.concatenate(uv)[use]
 
 
-def adjust_window(window: list[Frame], K: F64) -> tuple[bundle.BundleResult, I64, I64, F64]:
-    """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale. The result,
-    and of each of M sightings the keyframe, the landmark and the pixel (M, 2)."""
+AdjustedWindow = tuple[bundle.BundleResult, I64, I64, F64]
+"""Adjusted keyframes; of each of M sightings the keyframe, the landmark and the pixel (M, 2)."""
+
+
+def adjust_window(window: list[Frame], K: F64) -> AdjustedWindow:
+    """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale."""
     fixed = 1 if len(window) == 2 else 2
     ids, index, camera, uv_px = observations(window, K, 2)
     base, table = _baseline(window), window[0].landmarks

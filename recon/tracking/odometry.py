@@ -11,6 +11,7 @@ heading and position are corrected afterwards by :mod:`recon.posegraph.alignment
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +19,13 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
-from recon.tracking.focal_watch import FocalWatch
 from recon.tracking.frame import NO_IMAGE, UNKNOWN, Frame, Landmarks, Tracking
-from recon.tracking.keyframe_window import adjust_window, median_depth, triangulate
+from recon.tracking.keyframe_window import (
+    AdjustedWindow,
+    adjust_window,
+    median_depth,
+    triangulate,
+)
 from recon.tracking.localisation import (
     DISAGREES,
     LOOSE_PX,
@@ -75,13 +80,15 @@ class Odometry:
         lens: Camera | None = None,
         seeks_readout: bool = False,
         base_to_height: float = 0.1,
+        on_adjusted: Callable[[AdjustedWindow], None] | None = None,
     ) -> None:
         """``camera`` has no distortion and the size of the frames to come.
 
         ``lens`` is the camera with its distortion and shutter; None: a global shutter.
         ``seeks_readout``: its readout is a start, to be found by the images.
         ``base_to_height`` is the motion between keyframes over the distance to the ground; raises
-        ValueError where no two frames so close can be triangulated.
+        ValueError where no two frames so close can be triangulated. ``on_adjusted`` gets every
+        window that shares no keyframe with the one before.
         """
         if not MIN_BASE_TO_HEIGHT <= base_to_height <= 1.0:
             raise ValueError(f"base_to_height is {base_to_height}, not {MIN_BASE_TO_HEIGHT} to 1")
@@ -97,7 +104,7 @@ class Odometry:
         self._row_track = RowTrack(lens or camera, seeks_readout)
         clock = self._row_track.clock
         self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
-        self.focal, self._watched_seq = FocalWatch(self.K), -1
+        self._on_adjusted, self._given_seq = on_adjusted, -1
         self._rows_awaited: Frame | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self._row_track)
@@ -367,9 +374,10 @@ class Odometry:
         self._rows_awaited = key_new if new.row_motion.rows is not None else None
         window = self.keyframes[-WINDOW - 2 :]
         adjusted = adjust_window(window, self.K)
-        if len(window) > WINDOW and window[0].seq > self._watched_seq:
-            self._watched_seq = new.seq
-            self.focal.add(*adjusted)
+        is_next = len(window) > WINDOW and window[0].seq > self._given_seq
+        if is_next and self._on_adjusted is not None:
+            self._given_seq = new.seq
+            self._on_adjusted(adjusted)
         self._depth = median_depth(key_new)
         self._forget()
         return self._found(new, Tracking.KEYFRAME, key_new.T_odom_camera, int(seen[0][2].sum()))

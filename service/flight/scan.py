@@ -312,7 +312,7 @@ class Scan:
     def _focal_by_images(self) -> tuple[float, dict[str, Any] | None]:
         """Share by which the images contradict the focal length, 0 where they do not; and the
         change that they ask for, None where they show none."""
-        found = self.mapper.odometry.focal.estimate
+        found = self.mapper.focal.estimate
         if found is None:
             return 0.0, None
         change, sigma, windows = found

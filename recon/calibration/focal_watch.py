@@ -14,6 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from recon.tracking.bundle import HUBER_PX, BundleResult, linearise_all
+from recon.tracking.keyframe_window import AdjustedWindow
 from recon.types import F64, I64
 
 CELLS = 4  # rows and columns of cells of the landmarks
@@ -26,12 +27,12 @@ class FocalWatch:
         self._K = K
         self._cells: list[F64] = []  # (CELLS**2, 2, 3) information and score, of each window
 
-    def add(self, window: BundleResult, camera: I64, point: I64, uv_px: F64) -> None:
-        """Add an adjusted window, whose (M,) cameras saw (M,) of its points at (M, 2) undistorted
-        pixels; one without finite sightings says nothing."""
-        every = window.T_camera_world, window.points_m, uv_px
+    def add(self, window: AdjustedWindow) -> None:
+        """Add an adjusted window; one without finite sightings says nothing."""
+        result, camera, point, uv_px = window
+        every = result.T_camera_world, result.points_m, uv_px
         if len(uv_px) and all(np.isfinite(one).all() for one in every):
-            self._cells.append(_evidence(window, camera, point, uv_px, self._K))
+            self._cells.append(_evidence(result, camera, point, uv_px, self._K))
 
     @property
     def estimate(self) -> tuple[float, float, int] | None:

@@ -11,8 +11,8 @@ import pytest
 from command_line import skyrelief
 
 from recon import se3
+from recon.calibration.focal_watch import FocalWatch
 from recon.tracking import bundle
-from recon.tracking.focal_watch import FocalWatch
 from recon.types import F64, I64
 
 K = np.array([[480.0, 0.0, 320.0], [0.0, 480.0, 180.0], [0.0, 0.0, 1.0]])
@@ -67,7 +67,7 @@ def estimate(
     model[:2, 2] = K[:2, 2]
     watch = FocalWatch(model)
     for seed in range(windows):
-        watch.add(*window(pitch_deg, wobble_deg, longer, seed, bent))
+        watch.add(window(pitch_deg, wobble_deg, longer, seed, bent))
     found = watch.estimate
     assert found is not None and found[2] == windows
     return found[:2]
@@ -119,7 +119,7 @@ def test_a_window_without_finite_sightings_shows_nothing(broken: str) -> None:
     else:
         done.T_camera_world[4] = np.nan
     watch = FocalWatch(K)
-    watch.add(done, camera, point, uv_px)
+    watch.add((done, camera, point, uv_px))
     assert watch.estimate is None
 
 
