@@ -46,7 +46,7 @@ class Segment:
     similarity: Alignment | None = None  # once telemetry or a loop gives it
     constants: Constants = field(default_factory=Constants)  # errors it was fitted with
     offsets: Offsets | None = None  # of its sensors from the similarity
-    boresight: tuple[F64, F64] | None = None  # normal equations of what it shows of that
+    boresight: tuple[F64, F64] | None = None  # normal equations of what its attitudes show of it
     is_tied_by_loop: bool = False
     fitted: int = 0  # keyframes when the similarity was fitted last
     surface: list[int] = field(default_factory=list)  # its keyframes with depth
