@@ -41,7 +41,9 @@ def replay(
     video: Annotated[str, typer.Argument(help="a video, a folder of images, or - for a pipe")],
     telemetry: Annotated[
         Path | None,
-        typer.Option(help="flight log: .tlog, .BIN, .ulg or .SRT; default: the video's own"),
+        typer.Option(
+            help="flight log: .tlog, .BIN, .ulg, .SRT, AirData's .csv; default: the video's own"
+        ),
     ] = None,
     camera_model: Annotated[
         Path | None, typer.Option(help="camera_info YAML of 'skyrelief calibrate'")

@@ -39,7 +39,7 @@ from service.workers import python_command, run_to_end
 PARTS = {
     **dict.fromkeys((".zip", ".db", ".mcap"), "scan"),
     **dict.fromkeys((".mp4", ".mov", ".mkv", ".avi", ".ts", ".m4v"), "video"),
-    **dict.fromkeys((".tlog", ".bin", ".ulg", ".srt"), "--telemetry"),
+    **dict.fromkeys((".tlog", ".bin", ".ulg", ".srt", ".csv"), "--telemetry"),
     **dict.fromkeys((".yaml", ".yml"), "--camera-model"),
 }
 """What a file is, by its suffix: a scan already, or of a recording the video or an option of

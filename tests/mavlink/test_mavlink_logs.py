@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 import tracemalloc
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -235,7 +235,7 @@ def test_a_torn_end_is_no_failure(tmp_path: Path, cut: int) -> None:
     assert load_telemetry(path).counts["packets"] >= 3300
 
 
-@pytest.mark.parametrize("name", ["x.tlog", "x.BIN", "x.ulg", "x.SRT"])
+@pytest.mark.parametrize("name", ["x.tlog", "x.BIN", "x.ulg", "x.SRT", "x.csv"])
 @pytest.mark.parametrize("content", ["empty", "random", "zeros", "text"])
 def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, content: str) -> None:
     path = tmp_path / name
@@ -267,7 +267,7 @@ def test_no_file_and_an_unknown_kind_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no such"):
         load_telemetry(tmp_path / "none.tlog")
     (tmp_path / "x.txt").write_bytes(b"x")
-    with pytest.raises(ValueError, match=r"\.tlog, \.bin, \.ulg, \.srt"):
+    with pytest.raises(ValueError, match=r"\.tlog, \.bin, \.ulg, \.srt, \.csv"):
         load_telemetry(tmp_path / "x.txt")
 
 
@@ -427,6 +427,89 @@ def test_subtitles_of_several_drones(
         assert state.q_ned_body_wxyz is not None
         q = quaternion.from_rpy(*map(math.radians, (-7.0, 2.7, 110.1)))
         assert angle(state.q_ned_body_wxyz, q) < 1e-6
+
+
+# Flight records of AirData
+
+
+AIRDATA = (
+    "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff({u}),"
+    "height_above_ground_at_drone_location({u}),altitude_above_seaLevel({u}),speed(mph),"
+    " compass_heading(degrees), pitch(degrees), roll(degrees),isVideo,gimbal_heading(degrees),"
+    "gimbal_pitch(degrees),gimbal_roll(degrees),flycState,message"
+)
+
+
+def airdata(
+    path: Path, unit: str = "feet", off_deg: float = -27.0, lines: Iterable[str] = (),
+    dated: bool = True,
+) -> TelemetryLog:  # fmt: skip
+    """A record of 20 s, in which the vehicle turns at 12 degrees a second and its gimbal 3 degrees
+    behind, but for ``off_deg``."""
+    rows = [AIRDATA.format(u=unit), *lines]
+    up = 1 / 0.3048 if unit == "feet" else 1.0
+    for k in range(200):
+        yaw, head = 1.2 * k % 360.0, (1.2 * k - 3.0 + off_deg) % 360.0
+        date = f"2023-12-22 19:56:{32 + (k + 3) // 10:02d}"
+        rows.append(
+            f"{100 * k},{date if dated else ''},38.72{k:03d},-121.17,{50.0 * up},Available with"
+            f" any subscription,{150.0 * up},0,{yaw:.1f}, 2.7, -0.1,1,{head:.1f}"
+            f',-40.0,0,P-GPS,"Home Point updated, Data Recorder {k}"'
+        )
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8-sig")
+    return load_telemetry(path)
+
+
+@pytest.mark.parametrize("unit", ["feet", "meters"])
+def test_a_flight_record_of_airdata_is_read_in_its_own_units(tmp_path: Path, unit: str) -> None:
+    log = airdata(tmp_path / "flight.csv", unit)
+    assert (log.clock, log.may_lag) == ("unix", True)
+    assert log.counts["positions"] == log.counts["rows"] == 200
+    begin_ns = 1_703_274_992 * 10**9 + 300_000_000  # 2023-12-22 19:56:32.3 UTC
+    assert log.first_ns == begin_ns
+    state = log.history.state_at(begin_ns + 10 * 10**9)
+    assert state is not None and state.lat_deg == pytest.approx(38.721)
+    assert state.alt_agl_m == pytest.approx(50.0) and state.alt_amsl_m == pytest.approx(150.0)
+    assert state.q_ned_body_wxyz is not None and state.q_ned_gimbal_wxyz is not None
+    body = quaternion.from_degrees(-0.1, 2.7, 120.0)
+    assert body is not None and angle(state.q_ned_body_wxyz, body) < 1e-6
+    # What the gimbal lags by on the mean goes with what its heading is off by.
+    head = quaternion.from_degrees(0.0, -40.0, 120.0)
+    assert head is not None and angle(state.q_ned_gimbal_wxyz, head) < 1e-3
+    assert log.warnings == ("the gimbal's headings are -30 degrees off the nose: corrected",)
+
+
+def test_a_height_of_an_unknown_unit_is_none(tmp_path: Path) -> None:
+    log = airdata(tmp_path / "flight.csv", "furlongs")
+    state = log.history.state_at(log.first_ns)
+    assert state is not None and state.alt_agl_m is None and state.alt_amsl_m is None
+
+
+def test_a_record_without_dates_counts_from_its_start(tmp_path: Path) -> None:
+    log = airdata(tmp_path / "flight.csv", dated=False)
+    assert (log.clock, log.first_ns, log.last_ns) == ("boot", 0, 19_900_000_000)
+
+
+def test_a_gimbal_that_turns_by_itself_keeps_its_heading(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    airdata(path)
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    turning = [line.split(",") for line in lines[1:]]
+    for k, texts in enumerate(turning):
+        texts[12] = f"{1.8 * k % 360:.1f}"
+    path.write_text("\n".join([lines[0], *map(",".join, turning)]))
+    log = load_telemetry(path)
+    state = log.history.state_at(log.first_ns + 10 * 10**9)
+    head = quaternion.from_degrees(0.0, -40.0, 180.0)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None and head is not None
+    assert angle(state.q_ned_gimbal_wxyz, head) < 1e-6 and log.warnings == ()
+
+
+def test_lines_that_are_no_rows_of_a_record_are_left_out(tmp_path: Path) -> None:
+    bad = ['nan,"a lost quote', "1e99,,1,1", "x" * 40_000, "-5,2023-99-99 99:99:99", "\0", "100"]
+    log = airdata(tmp_path / "flight.csv", lines=bad)
+    assert log.counts["positions"] == 200 and log.counts["unreadable"] == 7
+    assert log.warnings[0] == "7 lines are no rows of the record"
 
 
 def cue(number: int, text: str) -> str:
@@ -1025,6 +1108,14 @@ def test_subtitles_of_any_fields_are_read_or_refused(draw: Draw) -> None:
     words += ["rel_alt:", "latitude: 999", "longitude: 1e400", "focal_len: 0.0", "GPS (", "-->"]
     cues = [cue(n, " ".join(draw.some(draw.choices(words, k=30)))) for n in range(6)]
     check_log(_written("".join(draw.some(cues)).encode() or b"\n", "log.SRT"))
+
+
+@EACH_TIME
+def test_flight_records_of_any_fields_are_read_or_refused(draw: Draw) -> None:
+    words = [*AIRDATA.format(u="feet").split(","), "1e400", "-", "2023-12-22 19:56:32", '"', "12.5"]
+    lines = [",".join(draw.some(draw.choices(words, k=20))) for _ in range(6)]
+    lines.insert(0, ",".join(draw.some(AIRDATA.format(u="feet").split(","))))
+    check_log(_written("\n".join(lines).encode() or b"\n", "log.csv"))
 
 
 def _written(content: bytes | bytearray, name: str) -> Path:

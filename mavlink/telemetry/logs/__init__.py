@@ -20,6 +20,7 @@ READERS: dict[str, str] = {
     ".bin": "mavlink.telemetry.logs.dataflash:load",
     ".ulg": "mavlink.telemetry.logs.ulog:load",
     ".srt": "mavlink.telemetry.logs.srt:load",
+    ".csv": "mavlink.telemetry.logs.airdata:load",
 }
 """File name extension (lower case) to ``module:function``. A new format is one file, one line."""
 
@@ -39,7 +40,7 @@ class TelemetryLog:
 
 
 def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> TelemetryLog:
-    """The vehicle history in a .tlog, .BIN, .ulg or DJI .SRT file, on the unix clock in ns.
+    """The vehicle history in a log, on the clock that it has, in ns.
 
     ValueError in one line when there is no such file, or when it contains no usable attitude and
     position. Damaged parts are skipped and counted.
