@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +19,16 @@ from service.packages import needing
 from service.scans.writing import check_writable, write_whole, writing
 
 if TYPE_CHECKING:
+    from recon.backends import Backend
     from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.types import F32, U8
+    from recon.types import F32, U8, DisparityMap
 
 log = logging.getLogger(__name__)
 
 MIN_SIDE_PX = 8
+
+LABEL_BYTES, FREE_SHARE = 3.2, 0.5
+"""Costs and messages of one label of one pixel, and how much of the free memory they may take."""
 
 Labels = Annotated[int, typer.Option(help="number of disparities")]
 MinDisparity = Annotated[int, typer.Option(help="the smallest disparity, px")]
@@ -55,8 +60,11 @@ def stereo(
     and surface outside the right image are unknown. --checked keeps only verified disparities,
     as in flight. Rows that lie apart, by a calibration a little off, are brought together;
     where one image is blurred, the other is blurred as much, and a little are both where noise
-    hides what they show; dark images are stretched.
+    hides what they show; dark images are stretched. Images too large for the memory are matched at
+    half their size, or a quarter, and upsampled.
     """
+    import psutil  # type: ignore[import-untyped]
+
     from recon.calibration.row_alignment import (
         features_apart,
         in_rows,
@@ -100,7 +108,8 @@ def stereo(
     gray_left, gray_right, *blurs_px = alike(stretch(gray_left), stretch(gray_right))
     start = time.perf_counter()
     with refusing("stereo"):
-        found = chosen.belief_propagation(gray_left, gray_right, labels, config)
+        free = psutil.virtual_memory().available if model is None else math.inf
+        found = matched(chosen, gray_left, gray_right, labels, config, free)
     seconds = time.perf_counter() - start
     write(out, image, found.px + config.min_disparity, labels, min_disparity)
     known = float((found.px == found.px).mean())
@@ -117,6 +126,40 @@ def stereo(
         elif any(blurs_px):
             said += f", {'left' if blurs_px[0] else 'right'} image sharper: blurred like the other"
         print(f"{out}: {_size(gray_left)}, {100 * known:.1f} % known, {chosen.name}{said}")
+
+
+def matched(
+    backend: Backend, left: U8, right: U8, labels: int, config: BeliefPropagationConfig,
+    free_bytes: float,
+) -> DisparityMap:  # fmt: skip
+    """Labels (h, w) of the left image by belief propagation.
+
+    A pair that would need more memory is matched on images of half the size, or a quarter, and
+    brought back by joint bilateral upsampling.
+    """
+    import cv2
+    import numpy as np
+
+    from recon.types import DisparityMap
+
+    shrink, (h, w) = 1, left.shape
+    while LABEL_BYTES * h * w * labels / shrink**3 > FREE_SHARE * free_bytes:
+        shrink *= 2
+    if shrink == 1 or min(h, w) < shrink * MIN_SIDE_PX:
+        return backend.belief_propagation(left, right, labels, config)
+    size = w // shrink, h // shrink
+    needed, free = (n / 2**30 for n in (LABEL_BYTES * h * w * labels, free_bytes))
+    log.warning(
+        "%d labels of %s need %.1f GiB, %.1f are free: matched on %dx%d and upsampled",
+        labels, _size(left), needed, free, *size,
+    )  # fmt: skip
+    few = replace(config, min_disparity=config.min_disparity // shrink)
+    count = -(-(config.min_disparity + labels) // shrink) - few.min_disparity + 1
+    a, b = (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in (left, right))
+    found = backend.belief_propagation(np.asarray(a), np.asarray(b), count, few)
+    fine = backend.upsample(found, np.repeat(left[..., None], 3, axis=2))
+    px = (fine.px + few.min_disparity) * np.float32(w / size[0]) - config.min_disparity
+    return DisparityMap(np.clip(px, 0.0, labels - 1.0), fine.confidence)
 
 
 def _warn_of_rows(lower_px: float | None) -> None:

@@ -21,7 +21,13 @@ from paths import SHARED
 from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
-from service.commands.stereo import matching_config
+from service.commands.stereo import (
+    FREE_SHARE,
+    LABEL_BYTES,
+    matched,
+    matching_config,
+    read_gray,
+)
 from service.compute.backend_choice import Choice, FallbackBackend, choose_backend
 from service.errors import InputError, OutsideError
 
@@ -69,6 +75,24 @@ def test_writes_disparity_in_pixels(
     drawn = cv2.imread(str(image))
     assert drawn is not None
     assert drawn.shape == (80, 160, 3)
+
+
+@pytest.mark.parametrize(("first", "labels"), [(0, 64), (20, 40), (-12, 80)])
+@pytest.mark.parametrize("shrink", [2, 4])
+def test_a_pair_that_needs_too_much_memory_is_matched_on_smaller_images(
+    pair: tuple[Path, Path], caplog: pytest.LogCaptureFixture, first: int, labels: int, shrink: int
+) -> None:
+    left, right = (np.asarray(cv2.resize(read_gray(path), (640, 320))) for path in pair)
+    config = matching_config(labels, 5, first, checked=False)
+    needed = LABEL_BYTES * left.size * labels / FREE_SHARE
+    found = matched(CpuBackend(), left, right, labels, config, needed / (shrink**3 - 0.5))
+    assert f"matched on {640 // shrink}x{320 // shrink} and upsampled" in caplog.text
+    assert found.px.shape == left.shape and found.confidence.shape == left.shape
+    assert abs(np.nanmedian(found.px[:, 80:]) + first - 38.0) < 0.4
+    assert np.nanmin(found.px) >= 0.0 and np.nanmax(found.px) <= labels - 1.0
+    caplog.clear()
+    whole = matched(CpuBackend(), left, right, labels, config, 2.0 * needed)
+    assert caplog.text == "" and abs(np.nanmedian(whole.px[:, 80:]) + first - 38.0) < 0.4
 
 
 @pytest.mark.parametrize("lower_px", [0.0, 0.3, 1.5, -2.0])
