@@ -64,13 +64,14 @@ def texture(
     found = consistent(look(mesh, views, share))
     progress("choosing a view for each triangle")
     neighbours = face_neighbours(mesh.faces)
-    slot = choose(found, neighbours)
+    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
+    middle = (a + b + c) / 3.0
+    slot = choose(by_angle(middle, views, found), neighbours)
     label = np.where(slot >= 0, found.view[np.arange(len(slot)), slot], -1).astype(np.int32)
     progress("levelling exposures")
     gains = levels(found, len(views))
-    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    fields, found = faded_steps((a + b + c) / 3.0, area, views, found, gains)
+    fields, found = faded_steps(middle, area, views, found, gains)
     fade_view, fade_share = fading(mesh.faces, label, len(mesh.vertices_m), len(views))
     progress("packing the atlas")
     rgb = spread_colours(mesh.faces, mesh.rgb, found, slot)
@@ -135,6 +136,23 @@ def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32) -> U8:
     return np.asarray(out, np.uint8)
 
 
+def by_angle(middle_m: F64, views: Sequence[TextureView], found: TriangleViews) -> TriangleViews:
+    """``found`` of triangles or cells with these middles (N, 3), with the resolution of pixels that
+    all span the angle of the image's middle one; rows keep their order.
+
+    Straight down from one height all images show level ground with the same pixels per metre. Those
+    at an image's edge span less, but the lens is no finer there, and what looks there aslant is
+    moved more by errors of height.
+    """
+    px_per_m = found.px_per_m.copy()
+    for number, n, slot in found.by_view():
+        T = views[number].T_world_camera
+        ways = middle_m[n] - T[:3, 3]
+        cosine = ways @ T[:3, 2] / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
+        px_per_m[n, slot] *= np.maximum(cosine, 0.0) ** 1.5
+    return replace(found, px_per_m=px_per_m)
+
+
 PENALTY = 0.6
 """Cost of an edge between triangles of different views; all resolution lost costs 1."""
 
@@ -147,8 +165,9 @@ SETTLED = 1e-3
 def choose(found: TriangleViews, neighbours: I32, iterations: int = ITERATIONS) -> I32:
     """(F,) the slot of ``found`` chosen for each triangle or cell, next to ``neighbours`` (F, E;
     -1: none); -1 where no view sees it."""
-    best = np.maximum(found.px_per_m[:, :1], 1e-9)
-    cost = np.where(found.view >= 0, 1.0 - found.px_per_m / best, np.float32(1e6))
+    is_seen = found.view >= 0  # views that were dropped leave their resolution behind
+    best = np.where(is_seen, found.px_per_m, 1e-9).max(axis=1, keepdims=True)
+    cost = np.where(is_seen, 1.0 - found.px_per_m / best, np.float32(1e6))
     return np.asarray(
         _propagated(found.view, cost.astype(np.float32), neighbours, PENALTY, iterations)
     )

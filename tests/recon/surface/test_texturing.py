@@ -23,6 +23,7 @@ from recon.surface.texture_views import (
 from recon.surface.texturing import (
     PENALTY,
     SPREAD_RINGS,
+    by_angle,
     choose,
     faded_steps,
     fading,
@@ -243,6 +244,22 @@ def test_resolution_falls_with_distance_and_slant() -> None:
     row = int(np.argmin(np.abs(sheet().vertices_m[sheet().faces].mean(axis=1)).sum(axis=1)))
     assert found.view[row, :2].tolist() == [1, 0]  # the nearer first
     np.testing.assert_allclose(found.px_per_m[row, :2], [200 / 14, 200 / 28], rtol=0.02)
+
+
+def test_of_images_from_one_height_the_steepest_is_chosen() -> None:
+    mesh = sheet()
+    views = [image(np.array([x, 0.0, 14.0])) for x in (-5.0, 5.0)]
+    middle, _ = middles(mesh)
+    found = by_angle(middle, views, look(mesh, views))
+    slot = choose(found, face_neighbours(mesh.faces))
+    clear = (found.view[:, 1] >= 0) & (np.abs(middle[:, 0]) > 0.5)
+    chosen = found.view[np.arange(len(slot)), slot]
+    assert clear.any() and ((chosen == 1) == (middle[:, 0] > 0))[clear].all()
+    down = np.degrees(np.arccos(14.0 / np.linalg.norm(middle - [-5.0, 0.0, 14.0], axis=1)))
+    sees = found.view == 0
+    px_per_m = np.where(sees, found.px_per_m, 0.0).max(axis=1)[sees.any(axis=1)]
+    expected = 200.0 / 14.0 * np.cos(np.radians(down[sees.any(axis=1)])) ** 1.5
+    np.testing.assert_allclose(px_per_m, expected, rtol=1e-3)
 
 
 def rows(view: list[list[int]], px: list[list[float]]) -> TriangleViews:
