@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -15,7 +16,7 @@ import numpy as np
 from recon.camera_model import Undistorter, scaled_K
 from recon.surface.texture_views import TextureView
 from recon.types import U8, Array, Keyframe
-from service.cameras import open_camera
+from service.cameras import CAMERAS, open_camera
 from service.cameras.images import ImagesSource
 from service.cameras.source import CameraSource
 from service.cameras.video import VideoSource
@@ -26,6 +27,8 @@ from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
 from service.scans.writing import SUMMARY
 from service.stream.records import ScanHeader
+
+log = logging.getLogger(__name__)
 
 SAME_TIME_NS = 5_000_000
 
@@ -51,6 +54,7 @@ class Recording:
 
     path: Path | None
     words: str  # for the operator
+    is_lost: bool = False  # the scan names one, and it is not there or no longer the same
 
 
 def recording_of(folder: Path, header: ScanHeader, within: Path | None = None) -> Recording:
@@ -72,15 +76,18 @@ def recording_of(folder: Path, header: ScanHeader, within: Path | None = None) -
         places = [own] if path.name not in ("", "..") and not os.path.islink(own) else []
     found = next((p for p in places if os.path.isfile(p) or os.path.isdir(p)), None)
     if found is None:
-        return Recording(None, f"{stored}: {named} is not there; give the flight's --video")
+        words = f"{stored}: {named[:200]!r} is not there; give the flight's --video"
+        is_live = named.partition(":")[0] in CAMERAS.keys() - {"file", "images"}
+        return Recording(None, words, is_lost=not is_live)
     try:
         camera, source = camera_of(header), open_camera(str(found))
         size_px = source.size_px
         source.close()
     except SkyreliefError as error:
-        return Recording(None, f"{stored}: {error}")
+        return Recording(None, f"{stored}: {error}", is_lost=True)
     if size_px != camera.size_px:
-        return Recording(None, f"{stored}: {found} is another recording; give the flight's --video")
+        words = f"{stored}: {found} is another recording; give the flight's --video"
+        return Recording(None, words, is_lost=True)
     return Recording(found, f"textures from {found}, which the scan was made from")
 
 
@@ -100,7 +107,9 @@ def shared_images(scan: ScanView, options: ExportOptions) -> list[TextureView]:
     def read() -> list[TextureView]:
         keyframes, header = list(main_keyframes(scan.store)), scan.store.header
         found, epoch_ns = recording_for(scan, options), options.video_epoch_ns
-        if found.words:
+        if found.is_lost:
+            log.warning("%s", found.words)
+        elif found.words:
             scan.progress(found.words)
         if found.path is None:
             return stored_images(keyframes)
@@ -109,7 +118,7 @@ def shared_images(scan: ScanView, options: ExportOptions) -> list[TextureView]:
         except SkyreliefError as error:
             if options.video is not None:
                 raise
-            scan.progress(f"the scan's own images after all: {error}")
+            log.warning("Textures from the scan's own images after all: %s", error)
             return stored_images(keyframes)
 
     return scan.shared(("images", images_key(options)), read)
