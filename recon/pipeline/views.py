@@ -16,7 +16,7 @@ from recon import se3
 from recon.calibration.adjusted_track import AnyTrack
 from recon.camera_model import Undistorter
 from recon.posegraph.pose_priors import FixAverage
-from recon.rolling_shutter import NEAR_S, depth_share, on_image
+from recon.rolling_shutter import depth_share
 from recon.row_errors import turn_shares
 from recon.stereo.posed_image import PosedImage
 from recon.tracking.frame import NO_IMAGE, TWO_ONLY, Frame, Tracking
@@ -37,7 +37,6 @@ AHEAD, KNOWN_KEPT, KNOWN_PARTNERS = 4, 12, 2
 each of ``compute.pairs``: such a track has no drift over wide baselines."""
 
 WIDEST = 0.45  # base to height of such partners, at most
-TRACKED = 128  # tracked frames whose places are remembered
 HELD = 5  # views that wait, at most, for the first estimate of an unstated readout: all are kept
 KNOWN_ROWS = np.zeros((1, 1), np.float32)  # no uncertain motion of rows adds to the sigma of depth
 
@@ -266,7 +265,6 @@ class VirtualStereoCamera:
         self._given: deque[Frame] = deque(maxlen=8)
         self._first = -1  # number of the newest view that was given with its first partner
         self._latest: Frame | None = None  # the last tracked frame, unless it is a view
-        self._tracked: deque[Frame] = deque(maxlen=TRACKED)  # without images
 
     def take(self, tracked: Frame) -> bool:
         """Whether the next frame becomes a view."""
@@ -276,7 +274,6 @@ class VirtualStereoCamera:
         if not tracked.is_placed:
             return False
         frame = replace(tracked, pyramid=(), features={}, mask=None)
-        self._tracked.append(tracked.without_images())
         is_view = self.selection.offer(frame)
         self._fixes.take(frame.T_odom_camera, frame.prior)
         if is_view:
@@ -366,7 +363,7 @@ class VirtualStereoCamera:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
         posed = PosedImage(
             None, view.gray, self._K, view.T_odom_camera, self._undistorter.valid,
-            blur_px=self._blur_px(view, points), seq=view.seq,
+            blur_px=self._blur_px(view), seq=view.seq,
         )  # fmt: skip
         rows = view.row_motion.rows
         if rows is None or not rows.clock.readout_s:
@@ -375,26 +372,10 @@ class VirtualStereoCamera:
         scene = inverse_depth_plane(ground[ground[:, 2] > 0])
         return replace(posed, rows=rows.now(), scene=scene)
 
-    def _blur_px(self, view: Frame, points: F64) -> F64 | None:
-        """(2,) px by which the middle of the image moved during the exposure, by the poses of the
-        frames before and after; None where images are sharp or those frames are too far away."""
+    def _blur_px(self, view: Frame) -> F64 | None:
+        """(2,) px by which the middle of the image moved during the exposure; None where images are
+        sharp or its motion is not known."""
         exposure_s = self._odometry.exposure.shown_s
-        if not exposure_s:
+        if not exposure_s or view.image_rad_s is None:
             return None
-        near = [
-            at for at in self._tracked
-            if abs(at.time_ns - view.time_ns) < 1e9 * NEAR_S and at.segment == view.segment
-        ]  # fmt: skip
-        near = [at for at in near if at.time_ns <= view.time_ns][-2:] + [
-            at for at in near if at.time_ns > view.time_ns
-        ][:1]
-        if len(near) < 2:
-            return None
-        depth = np.median(se3.transform(se3.inverse(view.T_odom_camera), points)[:, 2])
-        on_axis = se3.transform(view.T_odom_camera, np.array([[0.0, 0.0, depth]]))
-        first, last = (
-            self._K[0, 0] * on_image(se3.transform(se3.inverse(at.T_odom_camera), on_axis))
-            for at in (near[0], near[-1])
-        )
-        passed_ns = near[-1].time_ns - near[0].time_ns
-        return np.asarray((last - first)[0] * exposure_s * 1e9 / passed_ns)
+        return np.asarray(self._K[0, 0] * exposure_s * view.image_rad_s)

@@ -98,6 +98,7 @@ class Frame:
     tracks: int = 0  # corners found
     reason: str = ""  # why it has no pose
     row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known
+    image_rad_s: F64 | None = None  # (2,) motion of the image's middle; None for stills
     # Of a keyframe, which has no relative pose: its own, refined while it is in the window.
     T_camera_odom: F64 = field(default_factory=lambda: NOWHERE)
     # (6, 6) of the motion from the keyframe before, left of T_camera_before.

@@ -309,7 +309,7 @@ class Odometry:
         tracks = int(found.ok.sum())
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
         T_odom_camera = se3.inverse(T_camera_odom)
-        px_s = self._px_s(T_odom_camera, depth)
+        new = replace(new, image_rad_s=self._image_rad_s(T_odom_camera, depth))
         self._model.update(new.time_ns, T_odom_camera, new.prior)
         self._lost, self._refused = 0, 0 if self._heeds_turn else self._refused
         due = self._base_to_height * (OVERDUE if new.is_blurred else 1.0)
@@ -317,7 +317,9 @@ class Odometry:
             self._row_track.add(new.row_motion, T_camera_odom)
             self._readjust()
             return self._found(new, Tracking.TRACKED, T_odom_camera, tracks)
-        self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns, 1e-9 * self._image_gap_ns)
+        if new.image_rad_s is not None:
+            px_s = self.K[0, 0] * new.image_rad_s
+            self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns, 1e-9 * self._image_gap_ns)
         share = 0.5 * SEARCH_SHARE
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, MIN_TRACKS)
         found = found if isinstance(whole, str) else whole
@@ -329,12 +331,13 @@ class Odometry:
         self._model.correct(self.keyframes[-1].T_odom_camera)
         return placed
 
-    def _px_s(self, T_odom_camera: F64, depth: float) -> F64:
-        """(2,) motion of the image since the frame before; zero for stills, which are far apart."""
+    def _image_rad_s(self, T_odom_camera: F64, depth: float) -> F64 | None:
+        """(2,) motion of the image's middle since the frame before; None for stills, which are far
+        apart."""
         gap_s = 1e-9 * self._gap_ns
         if not (0.0 < gap_s < NEAR_S and np.isfinite(depth)):
-            return np.zeros(2)
-        return np.asarray(self.K[0, 0] / gap_s * self._model.across(T_odom_camera, depth))
+            return None
+        return np.asarray(self._model.across(T_odom_camera, depth) / gap_s)
 
     def _accept_two_views(self, new: Frame, found: TwoViewPose) -> Frame:
         """Make a keyframe of a frame that two views alone place."""
