@@ -10,7 +10,6 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.frame import NO_IMAGE, UNKNOWN, Frame, Landmarks, Tracking
-from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, Camera, PosePrior
@@ -25,7 +24,6 @@ class AdjustedTrack:
         """``stills`` by their number, as :func:`adjusted_still` gives them. ``lens`` is the camera
         with its distortion and shutter; ``sigma_readout_s`` is 0 for one that was given."""
         self.segment, self.keyframes = -1, list[Frame]()
-        self.exposure = ExposureWatch()
         self.readout = ReadoutSearch(RowClock(lens), lens.K) if sigma_readout_s else None
         if self.readout is not None:  # and its search is over
             self.readout.readout_s, self.readout.sigma_s = lens.shutter.readout_s, sigma_readout_s

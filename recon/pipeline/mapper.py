@@ -234,6 +234,7 @@ class Mapper:
         frames_per_step = self.views.selection.frames_per_step
         if not self.odometry.can_skip(time_ns, prior, frames_per_step):
             return ()  # frames are followed as fast as images move
+        self.views.pass_over(time_ns)
         skipped = Frame(NO_IMAGE, time_ns, seq, prior, segment=self.odometry.segment)
         return (*self._finished(), FramePosed(skipped))
 

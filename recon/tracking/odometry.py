@@ -37,7 +37,6 @@ from recon.tracking.localisation import (
     Located,
     TwoViewPose,
 )
-from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, Bool, Camera, PosePrior
@@ -100,7 +99,6 @@ class Odometry:
         self._lost = self._refused = 0  # frames in a row without a pose; by telemetry's turn
         self._missed_frame: Frame | None = None  # the last still, where it is lost
         self._model = ConstantVelocity(0, np.eye(4), UNKNOWN)  # of the newest segment
-        self.exposure = ExposureWatch()
         self._row_track = RowTrack(lens or camera, seeks_readout)
         clock = self._row_track.clock
         self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
@@ -109,7 +107,6 @@ class Odometry:
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self._row_track)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
-        self._image_ns = self._image_gap_ns = 0  # the same of images, also those skipped
         self._depth = float("nan")  # median of the last keyframe's landmarks
 
     # ---- one frame -------------------------------------------------------------------
@@ -117,7 +114,6 @@ class Odometry:
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
         """True for a frame that :meth:`track` need not see: the camera has hardly moved since.
         ``frames_per_step`` is how many frames at least are followed from keyframe to keyframe."""
-        self._meet(time_ns)
         if not self._is_metric or self._lost:
             return False
         moved, turned, gap_s = self._model.shift(time_ns, prior, self._depth)
@@ -125,11 +121,6 @@ class Odometry:
         max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
         step = max(moved / self._base_to_height, turned / MAX_TURN_RAD)
         return gap_s < max_gap_s and step * frames_per_step < 1.0
-
-    def _meet(self, time_ns: int) -> None:
-        """Take an image's time, when it is asked about and when it is tracked."""
-        if time_ns != self._image_ns:
-            self._image_gap_ns, self._image_ns = time_ns - self._image_ns, time_ns
 
     def needs_turn(self, time_ns: int) -> bool:
         """True where the prior of a frame should hold the camera's angular velocity."""
@@ -142,7 +133,6 @@ class Odometry:
         expected = self._expected(time_ns, prior)
         new = replace(frame, row_motion=self._row_track.expect(time_ns, prior, expected))
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
-        self._meet(time_ns)
         if not self.keyframes:
             return [self._start(new)]
         if not self._is_metric:
@@ -317,9 +307,6 @@ class Odometry:
             self._row_track.add(new.row_motion, T_camera_odom)
             self._readjust()
             return self._found(new, Tracking.TRACKED, T_odom_camera, tracks)
-        if new.image_rad_s is not None:
-            px_s = self.K[0, 0] * new.image_rad_s
-            self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns, 1e-9 * self._image_gap_ns)
         share = 0.5 * SEARCH_SHARE
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, MIN_TRACKS)
         found = found if isinstance(whole, str) else whole

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from recon.motion_blur import ExposureWatch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.sensor_offsets import Constants
 from recon.tracking.frame import Frame, Tracking
-from recon.tracking.motion_blur import ExposureWatch
 from recon.types import F64
 from service.scans.trust import scales_differ
 from service.stream.records import pack_covariance, pack_motion

@@ -210,8 +210,8 @@ class Scan:
     @property
     def motion_blur(self) -> dict[str, Any] | None:
         """The strongest blur so far, fit for JSON; None while the images are sharp."""
-        odometry = self.mapper.odometry
-        return motion_blur(odometry.exposure, float(self.inputs.camera.K[0, 0] / odometry.K[0, 0]))
+        finer = float(self.inputs.camera.K[0, 0] / self.mapper.odometry.K[0, 0])
+        return motion_blur(self.mapper.views.exposure, finer)
 
     def report_blur(self) -> None:
         """Report to the operator once that the images are blurred, and by what."""

@@ -14,10 +14,10 @@ from some_views import keyframe_at
 
 from recon import se3
 from recon.camera_model import Undistorter
+from recon.motion_blur import ExposureWatch
 from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.frame import Frame, Landmarks, Tracking
-from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import Camera, PosePrior
@@ -40,9 +40,9 @@ class KnownTrack:
     """What views ask of an odometry."""
 
     keyframes: list[Frame]
-    exposure: ExposureWatch
     readout: ReadoutSearch | None = None
     segment: int = 0
+    K = np.diag([30.0, 30.0, 1.0])
 
 
 def stereo_camera(
@@ -52,11 +52,12 @@ def stereo_camera(
     undistorter: Undistorter | None = None,
 ) -> VirtualStereoCamera:
     K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
-    track = KnownTrack(keys, Mock(ExposureWatch, shown_s=shown_s), readout)
-    return VirtualStereoCamera(
-        ViewSelection(), cast(Odometry, track),
+    views = VirtualStereoCamera(
+        ViewSelection(), cast(Odometry, KnownTrack(keys, readout)),
         undistorter or Undistorter(Camera(K, np.zeros(5), size)), Counter(),
     )  # fmt: skip
+    views.exposure = Mock(ExposureWatch, shown_s=shown_s)
+    return views
 
 
 def offer(
@@ -284,7 +285,7 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
         keys.append(plain.keyframe)
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         image_rad_s = np.array([-0.2, 0.1]) if i else None
-        views.take(replace(plain, state=state, image_rad_s=image_rad_s))
+        views.take(replace(plain, state=state, image_rad_s=image_rad_s, pyramid=(plain.gray,)))
     blurs = [view.image.blur_px for view in views.ready(everything=True)]
     if not exposure_s:
         assert blurs == [None] * 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from unittest.mock import Mock
 
 import cv2
@@ -12,11 +13,13 @@ from painted_ground import painted_ground
 from tracked_frame import undistorted
 
 from recon import se3
+from recon.camera_model import Undistorter
+from recon.motion_blur import ExposureWatch, streak_px
+from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
 from recon.stereo.virtual_stereo import drop_unseen, rectify
-from recon.tracking.motion_blur import ExposureWatch, streak_px
 from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Camera, PosePrior, StereoPair
 from service.flight.reports import blur_note, blur_warning, motion_blur
@@ -119,7 +122,8 @@ def pose(t_s: float) -> F64:
 def test_a_shutter_too_slow_for_the_speed_is_seen_in_the_images() -> None:
     ground, exposure_s = painted_ground(), 0.05
     odometry = Odometry(CAMERA)
-    assert motion_blur(odometry.exposure, 2.0) is None
+    views = VirtualStereoCamera(ViewSelection(), odometry, Undistorter(CAMERA), Counter())
+    assert motion_blur(views.exposure, 2.0) is None
     for i in range(int(5 * FPS)):
         t = i / FPS
         moments = t + exposure_s * np.linspace(-0.5, 0.5, 7)
@@ -127,8 +131,9 @@ def test_a_shutter_too_slow_for_the_speed_is_seen_in_the_images() -> None:
         gray = np.asarray(np.rint(np.mean(shots, axis=0)), np.uint8)
         T = pose(t)
         prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 2.0)
-        odometry.track(undistorted(gray, i, round(1e9 * t), prior))
-    blur = motion_blur(odometry.exposure, 2.0)
+        for tracked in odometry.track(undistorted(gray, i, round(1e9 * t), prior)):
+            views.take(tracked)
+    blur = motion_blur(views.exposure, 2.0)
     assert blur is not None and blur["exposure_ms"] == pytest.approx(50.0, rel=0.3)
     assert blur["blur_px"] > 10.0, "px of the recording, twice as fine"
     assert f"images by {blur['blur_px']:.0f} px" in blur_note(blur)
