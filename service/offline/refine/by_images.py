@@ -3,9 +3,8 @@
 The keyframes' images, and those that hold marks of surveyed points, are matched again at full
 size. One adjustment has their poses, the places seen, the telemetry and the surveyed points in it.
 Depth images and textures keep the camera that the scan was flown with, so poses are those of that
-camera, unless the images contradict it: of another one, its centre moved by a pixel, they would lie
-pixels apart where strips are flown both ways. The camera that fits the images best (if observable)
-is found alongside. Each depth image is scaled to the places that it shows.
+camera: with another one's they would lie pixels apart, even where it fits the images better. That
+one (if observable) is found alongside. Each depth image is scaled to the places that it shows.
 """
 
 from __future__ import annotations
@@ -49,10 +48,6 @@ HELD = replace(
     FREE, sigma_focal=1e-5, sigma_aspect=1e-5, sigma_centre=1e-6, sigma_k=1e-6, sigma_p=1e-7
 )
 
-WORSE = 1.05
-"""Times the error of the images by which they contradict the camera given. A focal length 2 % off,
-which bends an oblique track, makes it 1.1, a centre some pixels off, which turns poses, 1.01."""
-
 MIN_FIXES = 3
 """Measured places that place a piece."""
 
@@ -67,9 +62,8 @@ class ImageNetwork:
     """The result of an adjustment by images."""
 
     keyframes: int
-    given: Camera
+    given: Camera  # that the poses are of
     camera: Camera  # that fits the images best, or the one given
-    own: Camera  # that the poses are of, one of both
     poses: F64  # (V, 4, 4) T_world_camera: those of the keyframes, then of other marked frames
     points: F64  # (P, 3)
     seen: Sightings
@@ -142,11 +136,8 @@ def fitted(
     focal, why = focal_sigma(s.camera, sigmas), doubt(s.camera, given, sigmas, config)
     camera = given if why else s.camera
     held = network(given, tied.poses, tied.seen, known, camera_information(given, HELD))
-    errors_px = [float(np.median(one.solution.errors_px)) for one in (held, found)]
-    own = given if why or errors_px[0] <= WORSE * errors_px[1] else camera
-    found = held if own is given else found
-    s = found.solution
-    return ImageNetwork(keyframes, given, camera, own, s.poses, s.points, found.seen, focal, why)
+    s = held.solution
+    return ImageNetwork(keyframes, given, camera, s.poses, s.points, held.seen, focal, why)
 
 
 def marked_frames(
@@ -227,8 +218,7 @@ def adjusted(
     try:
         found = network(
             images.given, images.poses, images.seen, known,
-            camera_information(images.given, HELD if images.own is images.given else FREE),
-            seen, MARK_PX, True, near=images.own,
+            camera_information(images.given, HELD), seen, MARK_PX, True,
         )  # fmt: skip
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         raise InputError(f"the images do not tie the scan together ({error})") from error
