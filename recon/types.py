@@ -185,7 +185,10 @@ class DisparityMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthMap:
-    """Depth along the camera's z with one sigma per pixel; NaN where unknown."""
+    """Depth along the camera's z with one sigma per pixel; NaN where unknown.
+
+    Before the pose graph has placed it, its world is the odometry's, in the odometry's units.
+    """
 
     depth_m: F32  # (h, w), NaN = unknown
     sigma_m: F32  # (h, w), NaN where depth is

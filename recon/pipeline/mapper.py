@@ -198,10 +198,10 @@ class Mapper:
             self._first_stereo = DenseStereo(backend, first, matching, Counter(), None, untimed)
         trajectory = Trajectory(PoseGraph(config.graph_keyframes))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
-        self.keyframes = KeyframeMap(trajectory, loops, backend, self.rejected, timing)
+        self.keyframe_map = KeyframeMap(trajectory, loops, backend, self.rejected, timing)
         self.surface = SurfaceMap(trajectory.similarities, config.resolution_m, new_map)
         self.exposure = ExposureCompensation()
-        self.frame_poses = FramePoses(self.keyframes, self.is_settled)
+        self.frame_poses = FramePoses(self.keyframe_map, self.is_settled)
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
         self._ready = set[int]()  # numbers of all keyframes that are given out
         self._worker = worker(self.reconstruct)
@@ -297,28 +297,28 @@ class Mapper:
         self, view: StereoView, depth: DepthMap | None, bgr: U8, is_matched: bool
     ) -> Reconstructed:
         """The pose of a view, and its new surface."""
-        segment = self.keyframes.graph.segments[view.segment]
+        segment = self.keyframe_map.graph.segments[view.segment]
         if is_matched and not segment.judge(depth is not None):
             self.rejected[
                 CONTRADICTED if depth is None else f"{CONTRADICTED} in earlier views"
             ] += 1
             depth = None
-        pose = self.keyframes.add(view, depth)  # ICP onto the keyframe before, pose graph
+        pose = self.keyframe_map.add(view, depth)  # ICP onto the keyframe before, pose graph
         if depth is None:
             return pose, ()
-        is_plausible = self.keyframes.publish(view.seq, pose)
-        changed = PosesChanged(self.keyframes.trajectory.moved())
+        is_plausible = self.keyframe_map.publish(view.seq, pose)
+        changed = PosesChanged(self.keyframe_map.trajectory.moved())
         if not is_plausible:
             return pose, (changed,)
         with self._timing("map"):  # what is new
-            T_odom = self.keyframes.trajectory.odom_pose(view.seq)
+            T_odom = self.keyframe_map.trajectory.odom_pose(view.seq)
             depth, fresh = self.surface(view.seq, view.segment, depth, view.rows_share, T_odom)
             bgr = self.exposure(view.segment, depth, bgr)  # as bright as the map
         keyframe = keyframe_of(view, depth, bgr, fresh, pose)
         if self.debug is not None:
             metric = keyframe.depth
             self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
-        self.keyframes.add_surface(view, keyframe)
+        self.keyframe_map.add_surface(view, keyframe)
         return pose, (KeyframeReady(keyframe, stages=dict(self.debug or {})), changed)
 
     def _first_depth(self, view: StereoView) -> Callable[[], Reconstructed]:
@@ -336,10 +336,10 @@ class Mapper:
         return partial(self._place_first, view, depth, bgr)
 
     def _place_first(self, view: StereoView, depth: DepthMap | None, bgr: U8) -> Reconstructed:
-        predicted = self.keyframes.predicted(view)
+        predicted = self.keyframe_map.predicted(view)
         if predicted is None or depth is None:
             return None, ()
-        if self.keyframes.graph.segments[view.segment].agreement < 0:
+        if self.keyframe_map.graph.segments[view.segment].agreement < 0:
             return None, ()
         T_odom, pose = predicted
         depth, fresh = self.surface.peek(depth, view.rows_share, T_odom)
@@ -361,7 +361,7 @@ class Mapper:
             self._worker.close()
             self.reset_map()
         self.frame_poses.finish()
-        return (*events, *self._changed(self.keyframes.trajectory.moved(final=True)))
+        return (*events, *self._changed(self.keyframe_map.trajectory.moved(final=True)))
 
     def _finished(self, everything: bool = False) -> Iterator[Event]:
         for view, (pose, events) in self._worker.finished(everything):
@@ -416,7 +416,7 @@ class Mapper:
         ValueError for a mapper that does not keep its cloud."""
         if self._kept is None:
             raise ValueError("this mapper was made with keeps_cloud=False")
-        out = [*self.keyframes.apart(), *self.keyframes.false()]
+        out = [*self.keyframe_map.apart(), *self.keyframe_map.false()]
         kept = [k for seq, k in self._kept.items() if not any(a <= seq <= b for a, b in out)]
         sizes = [size for k in kept if (size := ground_sample_m(k.depth)) is not None]
         fine = voxel_m or min(sizes, default=1.0)

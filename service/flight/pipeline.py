@@ -99,7 +99,7 @@ class Pipeline:
             self.stopwatch,
             keeps_cloud=False,
         )
-        self.watch = GraphWatch(self.mapper.keyframes.graph)
+        self.watch = GraphWatch(self.mapper.keyframe_map.graph)
 
     def _in_background(
         self, rows: tuple[str, str] | None, live: bool, work: Reconstruct
@@ -127,4 +127,4 @@ class Pipeline:
         return {
             "map_voxels": 0 if known is None else len(known),
             "map_tiles_on_disk": known.tiles_on_disk if isinstance(known, PagedMap) else 0,
-        } | self.mapper.keyframes.held
+        } | self.mapper.keyframe_map.held

@@ -111,7 +111,7 @@ class Recorder:
         self._batch, self._due = batch, list[PoseRecord]()
         self.store, self.pipeline, self._rig = store, pipeline, rig
         self.mapper = pipeline.mapper
-        self._graph = self.mapper.keyframes.graph
+        self._graph = self.mapper.keyframe_map.graph
         self._first_scale: dict[int, float] = {}  # of keyframes, by number
         self._revisions: Counter[int] = Counter()  # poses of each, after the first
         self.points = self.keyframes = self.frames = self.chunk_bytes = self.image_bytes = 0
@@ -161,8 +161,8 @@ class Recorder:
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Finish the scan in the store, after :meth:`flush`; return its summary with ``extra``."""
         summary = self.summary() | {"graph": graph_figures(self._graph)}
-        summary["apart"] = [list(ends) for ends in self.mapper.keyframes.apart()]
-        summary["false"] = [list(ends) for ends in self.mapper.keyframes.false()]
+        summary["apart"] = [list(ends) for ends in self.mapper.keyframe_map.apart()]
+        summary["false"] = [list(ends) for ends in self.mapper.keyframe_map.false()]
         summary |= extra
         self.store.finish(summary)
         return summary
@@ -208,7 +208,7 @@ class Recorder:
             "stage_ms": {k: round(v, 2) for k, v in self.pipeline.stopwatch.mean_ms().items()},
             "refusals": dict(self.mapper.refusals()),
             "drops": self._drops(),
-            "registrations": {v.value: n for v, n in self.mapper.keyframes.verdicts.items()},
+            "registrations": {v.value: n for v, n in self.mapper.keyframe_map.verdicts.items()},
         }
 
     def _drops(self) -> dict[str, int]:

@@ -340,7 +340,7 @@ class Scan:
         out = [w for w in self.inputs.assumed if w != "start" or not self.check.is_clock_sure]
         if self.attitudes == 0 or self.check.is_stabilised:
             out.append("view")
-        if self.mapper.keyframes.is_levelled:
+        if self.mapper.keyframe_map.is_levelled:
             out.append("level")
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
@@ -382,14 +382,14 @@ class Scan:
                 f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
                 "set scan.assumed_agl_m to the true height"
             )
-        apart = self.mapper.keyframes.apart()
+        apart = self.mapper.keyframe_map.apart()
         if apart:
             out.append(
                 f"left out of the cloud: {len(apart)} of {self.mapper.segments} "
                 "segments of the flight, which neither loops nor fixes of known height and scale "
                 "tie to the rest; fly with more overlap, or with GNSS that states its accuracy"
             )
-        false = sum(len(s.surface) for s in self.mapper.keyframes.graph.segments.false())
+        false = sum(len(s.surface) for s in self.mapper.keyframe_map.graph.segments.false())
         if false:
             out.append(
                 f"left out of the cloud: {false} of {self.recorder.keyframes} keyframes, as the "

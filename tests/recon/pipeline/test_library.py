@@ -182,7 +182,7 @@ def test_a_keyframe_does_not_wait_until_the_track_is_found_again() -> None:
 def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:
     mapper = Mapper(CAMERA, worker=BrokenOff)
     mapper.drain()
-    mapper.keyframes.graph.refuted[1] = 2
+    mapper.keyframe_map.graph.refuted[1] = 2
     assert len(mapper.cloud()) == 0
 
 

@@ -117,7 +117,7 @@ def test_pages_of_a_map_that_begins_at_the_very_end_are_removed(
 
     def drain() -> tuple[()]:
         for seq, depth in enumerate(survey()[:40]):
-            T, track = depth.T_world_camera, pipeline.mapper.keyframes.trajectory
+            T, track = depth.T_world_camera, pipeline.mapper.keyframe_map.trajectory
             track.add(Node(seq, seq, 0, T, 1e-6 * np.eye(6), PosePrior()))
             pipeline.mapper.surface(seq, 0, depth, KNOWN_ROWS, T)
         assert pages.exists() and pipeline.held["map_tiles_on_disk"] > 0

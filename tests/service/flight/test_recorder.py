@@ -77,7 +77,7 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
         return pose(frame.seq, of_m)
 
     pipeline = MagicMock()
-    pipeline.mapper.keyframes.graph = graph
+    pipeline.mapper.keyframe_map.graph = graph
     pipeline.mapper.frame_poses.place = place
     pipeline.mapper.is_settled.return_value = False
     return Recorder(store, pipeline, Mock(Rig, local_frame=None, georeference="none"), batch=batch)
