@@ -479,6 +479,17 @@ def test_a_flight_record_of_airdata_is_read_in_its_own_units(tmp_path: Path, uni
     assert log.warnings == ("the gimbal's headings are -30 degrees off the nose: corrected",)
 
 
+def test_a_column_without_a_name_moves_none_of_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    airdata(path)
+    first, *rows = path.read_text(encoding="utf-8-sig").splitlines()
+    path.write_text("\n".join(["," + first, *("7.5," + row for row in rows)]))
+    log = load_telemetry(path)
+    assert log.counts["positions"] == 200
+    state = log.history.state_at(log.first_ns)
+    assert state is not None and state.lat_deg == pytest.approx(38.72)
+
+
 def test_a_height_of_an_unknown_unit_is_none(tmp_path: Path) -> None:
     log = airdata(tmp_path / "flight.csv", "furlongs")
     state = log.history.state_at(log.first_ns)

@@ -35,6 +35,12 @@ LONGEST_LINE = 16_384  # letters; the rest of a line is a line of its own
 MAX_TIME_MS = 1e9  # eleven days
 
 COLUMN = re.compile(r"\s*(\w+)\s*(?:\((\w+)\))?\s*")
+READ = {
+    "time", "datetime", "latitude", "longitude", "height_above_takeoff", "altitude_above_sealevel",
+    "roll", "pitch", "compass_heading", "gimbal_roll", "gimbal_pitch", "gimbal_heading",
+}  # fmt: skip
+"""Columns; the other forty are not kept."""
+
 METRES = {"feet": 0.3048, "ft": 0.3048, "meters": 1.0, "m": 1.0}
 DATE = re.compile(r"\s*(20\d\d-\d\d-\d\d \d\d:\d\d:\d\d)")
 
@@ -98,11 +104,10 @@ def _rows(path: Path) -> Iterator[Row]:
             except csv.Error:
                 texts = []
             if not names:
-                columns = [found.groups("") for found in map(COLUMN.match, texts) if found]
-                names = [name.lower() for name, _ in columns] or [""]
-                yield {name: unit.lower() for name, (_, unit) in zip(names, columns, strict=False)}
-            else:
-                yield dict(zip(names, texts, strict=False))
+                found = [COLUMN.match(text) for text in texts] or [None]
+                names = ["" if one is None else one[1].lower() for one in found]
+                texts = ["" if one is None else (one[2] or "").lower() for one in found]
+            yield {name: text for name, text in zip(names, texts, strict=False) if name in READ}
 
 
 def _gimbal_off_deg(rows: Sequence[Row]) -> float:
