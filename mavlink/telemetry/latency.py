@@ -127,10 +127,9 @@ class LatencyWatch:
         fit = _fit(seen, track, 1e-3 * latency_ms)
         if fit is None:
             return None
-        times = seen.start_s[fit.good], seen.end_s[fit.good]
-        turns, _ = track.turns(*(time_s - 1e-3 * latency_ms for time_s in times))
-        head, images = turns @ R_head.T, seen.rate[fit.good] * (times[1] - times[0])[:, None]
-        a, b = (turn[:, 1] + 1j * turn[:, 2] for turn in (head, images))  # across the line of sight
+        head, images = fit.ours @ fit.R @ R_head.T, seen.rate
+        # Complex numbers: what lies across the line of sight.
+        a, b = (rate[fit.good, 1] + 1j * rate[fit.good, 2] for rate in (head, images))
         power = float(np.linalg.norm(a) * np.linalg.norm(b))
         together = complex(np.vdot(a, b))
         return float(np.angle(together)), abs(together) / max(power, 1e-30)
@@ -209,6 +208,7 @@ class LatencyWatch:
 class _Fit:
     """Telemetry against the images at one latency."""
 
+    R: F64  # (3, 3) from telemetry's axes to the camera's
     ours: F64  # (N, 3) telemetry's rates in the camera's axes
     rest: F64  # (N, 3) the images' rates minus these
     known: Bool  # (N,) telemetry is available
@@ -238,13 +238,14 @@ def _fit(seen: _Turns, track: Attitudes, lag_s: float) -> _Fit | None:
     if known.sum() < MIN_WINDOWS:
         return None
     ours = turns / (seen.end_s - seen.start_s)[:, None]
-    ours = ours @ best_rotation(ours[known], seen.rate[known]).T
+    R = best_rotation(ours[known], seen.rate[known])
+    ours = ours @ R.T
     rest = seen.rate - ours
     a, b = ours[known], seen.rate[known]
     of_images = max(float((b**2).sum()), 1e-30)
     power = float(np.sqrt((a**2).sum() * of_images))
     correlation = float((a * b).sum()) / power if power > 0.0 else 0.0
-    return _Fit(ours, rest, known, float((rest[known] ** 2).sum()) / of_images, correlation)
+    return _Fit(R, ours, rest, known, float((rest[known] ** 2).sum()) / of_images, correlation)
 
 
 def _best_lag(seen: _Turns, track: Attitudes, lags: F64) -> float | None:

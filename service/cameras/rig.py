@@ -99,6 +99,7 @@ class Rig:
 
     def turn_images(self, image_roll_deg: float) -> None:
         """Take images as turned clockwise by so much against gimbal or mount from now on."""
+        self.image_roll_deg = image_roll_deg
         self._R_head_camera = gimbal_from_camera(image_roll_deg)
         self._R_body_camera = body_from_head(self._camera) @ self._R_head_camera
 

@@ -194,7 +194,8 @@ class Scan:
         assert isinstance(posed, FramePosed)
         self.check.add(time_ns, posed.frame)
         self.rig.is_stabilised = self.check.is_stabilised
-        self.rig.turn_images(self.check.image_roll_deg)
+        if self.check.image_roll_deg != self.rig.image_roll_deg:
+            self.rig.turn_images(self.check.image_roll_deg)
         self.tracking.add(posed.frame, time_ns)
         self.report_blur()
         for doubt in self.pipeline.new_doubts():
