@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
+from scipy.sparse.linalg import cg
 
 from recon.surface.meshing import Mesh, face_neighbours
 from recon.surface.texture_atlas import Layout, Palette, images_of, lay_out, paint
@@ -103,37 +104,38 @@ def _split(mesh: Mesh, layout: Layout) -> Mesh:
     )
 
 
-SPREAD_RINGS = 12
-"""So many rings of vertices around what views show take its colours."""
+OWN_WEIGHT = 3.0 / 20.0**2
+"""Of a vertex's own colour next to those of the vertices around it: what views show fades by e in
+twenty vertices (on a regular mesh the sum of the differences to neighbours is 3 h^2 times the
+Laplacian)."""
 
 
 def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32) -> U8:
-    """(V, 3) colours for triangles without a view: those of the seen ones around them, beyond
-    SPREAD_RINGS the vertices' own ``rgb``.
+    """(V, 3) colours for triangles without a view: those of the seen ones around them, far from
+    these the vertices' own ``rgb``.
 
-    A vertex's own colour is that of the upper surface above or below it: a roof's, on a wall.
+    Between seen ones they are harmonic, each the mean of those around it, so details of what is
+    seen leave no streaks in what is not. A vertex's own colour is that of the upper surface above
+    or below it: a roof's, on a wall.
     """
     rows = np.flatnonzero(slot >= 0)
-    shown = found.bgr[rows, slot[rows]]
-    corner = np.repeat(np.arange(len(rows)), 3), faces[rows].ravel()
-    ones = np.ones(3 * len(rows), np.float32)
-    total = sparse.csr_matrix((ones, corner), (len(rows), len(rgb))).T @ np.column_stack(
-        [shown[:, ::-1], np.ones(len(rows), np.float32)]
-    )
+    shown = found.bgr[rows, slot[rows], ::-1]
+    colour = rgb.astype(np.float64)
+    corner = faces[rows].ravel()
+    count = np.bincount(corner, minlength=len(rgb))
+    is_seen = count > 0
+    for k in range(3):
+        total = np.bincount(corner, np.repeat(shown[:, k], 3), len(rgb))
+        colour[is_seen, k] = total[is_seen] / count[is_seen]
     ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    one_way = sparse.csr_matrix((np.ones(faces.size, np.float32), ends), (len(rgb), len(rgb)))
-    around = one_way + one_way.T
-    known = total[:, 3] > 0
-    colour = total[:, :3] / np.maximum(total[:, 3:], 1.0)
-    for _ in range(SPREAD_RINGS):
-        count = np.where(known, 0.0, around @ known.astype(np.float32))
-        new = count > 0
-        if not new.any():
-            break
-        colour[new] = (around[new] @ (colour * known[:, None])) / count[new, None]
-        known |= new
-    out = np.where(known[:, None], np.clip(np.rint(colour), 0, 255), rgb)
-    return np.asarray(out, np.uint8)
+    one_way = sparse.csr_matrix((np.ones(faces.size), ends), (len(rgb), len(rgb)))
+    rest = np.flatnonzero(~is_seen)
+    around = (one_way + one_way.T)[rest]
+    A = sparse.diags(np.asarray(around.sum(axis=1)).ravel() + OWN_WEIGHT) - around[:, rest]
+    wanted = around[:, is_seen] @ colour[is_seen] + OWN_WEIGHT * colour[rest]
+    for k in range(3):
+        colour[rest, k] = cg(A, wanted[:, k], colour[rest, k])[0]
+    return np.asarray(np.clip(np.rint(colour), 0, 255), np.uint8)
 
 
 def by_angle(middle_m: F64, views: Sequence[TextureView], found: TriangleViews) -> TriangleViews:
