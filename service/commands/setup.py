@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -153,12 +154,23 @@ def keys(
 def warm_up(config: ConfigFile = None, set_: Overrides = None, as_json: AsJson = False) -> None:
     """Compile all kernels before the first flight, by a scan of synthetic ground.
 
-    Run it as the service's user with its NUMBA_CACHE_DIR; the installer does.
+    Run it as the service's user with its NUMBA_CACHE_DIR; the installer does. Where the packages of
+    mesh, splats and maps are installed, their kernels are compiled, too.
     """
     from service.daemon.warm_up import warm_up as scan_made_up_ground
+    from service.offline.exports import PACKAGES
+    from service.offline.exports.view import ExportOptions, ScanView, export
+
+    def make_products(folder: Path) -> None:
+        with ScanView(folder, progress=progress) as scan:
+            for kind in ("glb", "splat", "ortho"):
+                if all(find_spec(package) for package in PACKAGES[kind]):
+                    with progress.part(f"compiling the kernels of {kind}", of_rest=0.5):
+                        export(scan, kind, None, ExportOptions())
 
     with showing("warm-up") as progress:
-        seconds, keyframes = scan_made_up_ground(load_config(config, set_ or []), progress)
+        loaded = load_config(config, set_ or [])
+        seconds, keyframes = scan_made_up_ground(loaded, progress, make_products)
     if as_json:
         print(json.dumps({"seconds": round(seconds, 2), "keyframes": keyframes}))
     else:

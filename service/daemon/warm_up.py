@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -59,9 +59,11 @@ class SyntheticGround(CameraSource):
             yield CameraFrame(image, 100_000_000 * i, i, None, f"frame {i}")
 
 
-def warm_up(config: Config, progress: Progress) -> tuple[float, int]:
-    """Scan the synthetic ground with the configured backend; returns (seconds, keyframes). Writes
-    the marker that :func:`is_warm` checks."""
+def warm_up(
+    config: Config, progress: Progress, export: Callable[[Path], None] = lambda _: None
+) -> tuple[float, int]:
+    """Scan the synthetic ground with the configured backend, and ``export`` from the scan's folder;
+    returns (seconds, keyframes). Writes the marker that :func:`is_warm` checks."""
     from recon.backends.cpu import warm_up as warm_up_backend
     from recon.types import Camera
     from service.compute.backend_choice import open_backend
@@ -87,12 +89,13 @@ def warm_up(config: Config, progress: Progress) -> tuple[float, int]:
         )
         store = create_store(inputs)
         scan = Scan(inputs, store)
-        with progress.part("compiling the others by a scan of synthetic ground", of_rest=0.9):
+        with progress.part("compiling the others by a scan of synthetic ground", of_rest=0.5):
             say = progress.counting(FRAMES)
             scan.run(Event(), lambda _: say(progress.text))
         summary = scan.close()
         write_deliverables(Path(folder), store)
         store.close()
+        export(Path(folder))
     marker = _marker(os.environ.get("NUMBA_CACHE_DIR", ""))
     if marker is not None:
         guarded(f"marker {marker}", lambda: write_whole(marker, software()))

@@ -38,8 +38,13 @@ def test_made_up_ground_is_scanned_and_marked(
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     assert not is_warm()
-    seconds, keyframes = warm_up(load_config(None, ["compute.backend=cpu"]), Progress())
-    assert seconds > 0
+    exported = list[str]()
+    seconds, keyframes = warm_up(
+        load_config(None, ["compute.backend=cpu"]),
+        Progress(),
+        lambda folder: exported.extend(path.name for path in folder.iterdir()),
+    )
+    assert seconds > 0 and "scan.db" in exported
     assert keyframes >= 5
     assert is_warm()
     assert not is_warm("another version")
