@@ -37,6 +37,24 @@ def test_between_two_heights_nothing_is_higher_or_lower() -> None:
     assert (np.diff(found[100]) > -1e-3).all() and found.min() >= 9.99 and found.max() <= 14.01
 
 
+def test_what_is_mirrored_is_filled_alike() -> None:
+    height = (np.hypot(ROWS - 60, COLS - 90) * CELL_M).astype(np.float32)
+    fixed = np.hypot(ROWS - 90, COLS - 130) > 50
+    found = between(height, fixed, ~fixed, CELL_M)
+    for axes in (0, 1):
+        other = between(*(np.flip(a, axes).copy() for a in (height, fixed, ~fixed)), CELL_M)
+        np.testing.assert_allclose(np.flip(other, axes), found, atol=0.05)  # ties of the nearest
+
+
+def test_a_difference_to_the_known_heights_fades_out_over_a_metre() -> None:
+    height = np.zeros(ROWS.shape, np.float32)
+    fixed = COLS < 100
+    height[100, 99] = 1.0  # its block of two by two cells has a fourth of that
+    found = between(height, fixed, ~fixed, CELL_M)[100, 100:]
+    assert found[0] > 0.6 and found[0] - found[1] < 0.25
+    assert 0.2 * found[0] < found[4] < 0.6 * found[0] and found[16] < 0.1
+
+
 def test_every_cell_inside_is_filled_from_the_lower_side() -> None:
     """A roof of 6 m with a hole, and a gap of 1.5 m around it."""
     roof = (np.abs(ROWS - 100) < 40) & (np.abs(COLS - 120) < 40)
