@@ -69,6 +69,9 @@ SUBSETS = 2
 """Colours are fitted to every other view, then to the others (ordered subsets, Hudson and Larkin
 1994, doi:10.1109/42.363108): as good as two rounds of all, in half the time."""
 
+VIEWS_PER_THREAD = 4
+"""What each has found is in memory for so many views at a time."""
+
 AROUND = np.ones((2 * NORMAL_PX + 1,) * 2, np.uint8)
 """Of a pixel: what its normal is taken from."""
 
@@ -389,10 +392,8 @@ def _fillings(
 def _hide(splats: Splats, view: TextureView, left: F32) -> None:
     """Take from ``left`` (h, w), the share of light from behind, what the Gaussians hide; at least
     until they cover a pixel."""
-    h, w = left.shape
-    rows, _ = _in_view(splats, view.K, (w, h), view.T_world_camera)
-    flat = _projected(splats, rows, view.K, (w, h), view.T_world_camera)
-    _cover(flat, splats.opacity.take(rows), left, 1.0 - COVERED)
+    _, flat = _projected(splats, view.K, left.shape[::-1], view.T_world_camera)
+    _cover(flat, left, 1.0 - COVERED)
 
 
 def _fitted(
@@ -401,39 +402,21 @@ def _fitted(
     """The Gaussians with colours that reproduce the images better: each takes the mean error of the
     pixels that it colours."""
 
-    rooms = [NO_SHARES] * threads()
-
-    def errors(number: int, room: int) -> tuple[I32, F32]:
+    def errors(view: TextureView) -> tuple[I32, F32]:
         progress("fitting colours")
-        view = views[number]
-        h, w = view.bgra.shape[:2]
-        rows, flat = _nearest_first(splats, view.K, (w, h), view.T_world_camera)
-        reached = _pixels_reached(flat, w, h)
-        if reached > len(rooms[room]):
-            rooms[room] = np.empty(reached, np.float32)
-        shares, pixels = rooms[room][:reached], _unlit(w, h)
-        _blend(flat, splats.opacity.take(rows), rgb.take(rows, 0), pixels, shares, DONE)
-        error = view.bgra[..., 2::-1].astype(np.float32) - pixels[..., :3]
-        error[(view.bgra[..., 3] == 0) | (pixels[..., 3] > 1.0 - COVERED)] = np.nan
-        return rows, _back(flat, error, shares)
+        size_px = view.bgra.shape[1], view.bgra.shape[0]
+        rows, flat = _projected(splats, view.K, size_px, view.T_world_camera)
+        return rows, _errors(flat, *_tiled(flat, *size_px), view.bgra)
 
-    rgb = splats.rgb
     for first in range(SUBSETS):
-        sums = np.zeros((len(splats), 4), np.float32)
-        subset = range(first, len(views), SUBSETS)
-        for at in range(0, len(subset), len(rooms)):
-            some = enumerate(subset[at : at + len(rooms)])
-            for rows, found in run_parallel(*(partial(errors, n, room) for room, n in some)):
-                _add_rows(sums, rows, found)
-        rgb = np.clip(rgb + sums[:, :3] / np.maximum(sums[:, 3:], 0.05), 0, 255)
-    return replace(splats, rgb=rgb)
-
-
-def _unlit(w: int, h: int) -> F32:
-    """(h, w, 4) black pixels that nothing hides."""
-    pixels = np.zeros((h, w, 4), np.float32)
-    pixels[..., 3] = 1.0
-    return pixels
+        sums, subset = np.zeros((len(splats), 4), np.float32), views[first::SUBSETS]
+        together = VIEWS_PER_THREAD * threads()
+        for at in range(0, len(subset), together):
+            for found in run_parallel(*(partial(errors, v) for v in subset[at : at + together])):
+                _add_rows(sums, *found)
+        rgb = splats.rgb + sums[:, :3] / np.maximum(sums[:, 3:], 0.05)
+        splats = replace(splats, rgb=np.clip(rgb, 0, 255))
+    return splats
 
 
 @njit(cache=True, nogil=True)
@@ -451,24 +434,15 @@ def rendered(
     As the reference draws them: projected to first order, sorted by depth, front to back.
     """
     w, h = size_px
-    rows, flat = _nearest_first(splats, K, size_px, T_world_camera)
-    pixels = _unlit(w, h)
-    _blend(flat, splats.opacity.take(rows), splats.rgb.take(rows, 0), pixels, NO_SHARES, DONE)
-    return pixels[..., :3], 1.0 - pixels[..., 3]
+    _, flat = _projected(splats, K, size_px, T_world_camera)
+    image = np.empty((h, w, 4), np.float32)
+    _draw(flat, *_tiled(flat, w, h), image)
+    return image[..., :3], 1.0 - image[..., 3]
 
 
-def _nearest_first(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[I32, F32]:
-    """(M,) the Gaussians that may show in an image, and (M, 7) where; of those equally near, of
-    which flat ground has many, the first one first on every machine."""
-    rows, depth = _in_view(splats, K, size_px, T)
-    # The bits of positive numbers are in their order, and 16 of them are sorted by digits: twice
-    # that takes a third of the time.
-    bits = depth.view(np.uint32)
-    order = np.argsort(bits.astype(np.uint16), kind="stable")
-    high = (bits >> 16).astype(np.uint16)[order]
-    order = order[np.argsort(high, kind="stable")]
-    flat = _projected(splats, rows, K, size_px, T)  # before they are sorted: they lie together
-    return rows.take(order), flat.take(order, 0)
+Tiled = tuple[I64, I32, int]
+"""(T + 1,) where each tile of an image begins in what follows; the Gaussians that reach into the
+tiles; the most pixels that those of one tile reach in it together."""
 
 
 def _widest(K: F64, size_px: tuple[int, int]) -> tuple[float, float]:
@@ -477,59 +451,40 @@ def _widest(K: F64, size_px: tuple[int, int]) -> tuple[float, float]:
     return WIDEST * x, WIDEST * y
 
 
-def _in_view(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[I32, F32]:
-    """(M,) the Gaussians that may show in an image, in their own order, and (M,) their depth."""
+def _projected(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[I32, F32]:
+    """(M,) the Gaussians that may show in an image, in their own order, and (M, 12) of each: u, v,
+    the inverse covariance uu, uv, vv in the image, how many pixels it reaches along u and v,
+    opacity, RGB, and its depth, m."""
+    rows, flat = np.empty(len(splats), np.int32), np.empty((len(splats), 12), np.float32)
+    arrays = (getattr(splats, f.name) for f in fields(splats))
     T_camera_world = np.ascontiguousarray(se3.inverse(T))
-    widest = _widest(K, size_px)
-    found = _reached(splats.xyz_m, splats.sigma_m, K, T_camera_world, size_px, widest)
-    return found[0], found[1]
-
-
-@njit(cache=True, nogil=True)
-def _reached(
-    xyz: F32, sigma: F32, K: F64, T: F64, size_px: tuple[int, int], widest: tuple[float, float]
-) -> tuple[I32, F32]:
-    """Rows and depths, m, by a bound of how far each reaches in the image."""
-    rows, depth = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.float32)
-    length = K[0, 0] * np.sqrt(1.0 + widest[0] ** 2), K[1, 1] * np.sqrt(1.0 + widest[1] ** 2)
-    count = 0
-    for n in range(len(xyz)):
-        z = T[2, 0] * xyz[n, 0] + T[2, 1] * xyz[n, 1] + T[2, 2] * xyz[n, 2] + T[2, 3]
-        if z <= 0.1:
-            continue
-        x = T[0, 0] * xyz[n, 0] + T[0, 1] * xyz[n, 1] + T[0, 2] * xyz[n, 2] + T[0, 3]
-        y = T[1, 0] * xyz[n, 0] + T[1, 1] * xyz[n, 1] + T[1, 2] * xyz[n, 2] + T[1, 3]
-        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        longest = max(sigma[n, 0], sigma[n, 1], sigma[n, 2]) / z
-        reach_u = REACH * np.sqrt(LOW_PASS_PX2 + (length[0] * longest) ** 2)
-        reach_v = REACH * np.sqrt(LOW_PASS_PX2 + (length[1] * longest) ** 2)
-        if -reach_u < u < size_px[0] + reach_u and -reach_v < v < size_px[1] + reach_v:
-            rows[count], depth[count] = n, z
-            count += 1
-    return rows[:count].copy(), depth[:count].copy()
-
-
-def _projected(splats: Splats, rows: I32, K: F64, size_px: tuple[int, int], T: F64) -> F32:
-    """(M, 7) of some Gaussians before the camera: u, v, the inverse covariance uu, uv, vv in the
-    image, and how many pixels they reach along u and v."""
-    flat = np.empty((len(rows), 7), np.float32)
-    T_camera_world = np.ascontiguousarray(se3.inverse(T))
-    arrays = rows, splats.xyz_m, splats.q_wxyz, splats.sigma_m
-    _project(*arrays, K, T_camera_world, _widest(K, size_px), flat)
-    return flat
+    count = _project(*arrays, K, T_camera_world, size_px, _widest(K, size_px), rows, flat)
+    return rows[:count], flat[:count]
 
 
 @njit(cache=True, nogil=True)
 def _project(
-    rows: I32, xyz: F32, q: F32, sigma: F32, K: F64, T: F64, widest: tuple[float, float], out: F32
-) -> None:
+    xyz: F32, q: F32, sigma: F32, opacity: F32, rgb: F32, K: F64, T: F64,
+    size_px: tuple[int, int], widest: tuple[float, float], rows: I32, out: F32,
+) -> int:  # fmt: skip
+    """Fill ``rows`` and ``out``; of how many. A bound of how far each reaches in the image says
+    which."""
     R = np.empty((3, 3))
-    for m in range(len(rows)):
-        n = rows[m]
-        x = T[0, 0] * xyz[n, 0] + T[0, 1] * xyz[n, 1] + T[0, 2] * xyz[n, 2] + T[0, 3]
-        y = T[1, 0] * xyz[n, 0] + T[1, 1] * xyz[n, 1] + T[1, 2] * xyz[n, 2] + T[1, 3]
+    length = K[0, 0] * np.sqrt(1.0 + widest[0] ** 2), K[1, 1] * np.sqrt(1.0 + widest[1] ** 2)
+    m = 0
+    for n in range(len(xyz)):
         z = T[2, 0] * xyz[n, 0] + T[2, 1] * xyz[n, 1] + T[2, 2] * xyz[n, 2] + T[2, 3]
-        x, y, fx, fy = x / z, y / z, K[0, 0] / z, K[1, 1] / z
+        if z <= 0.1:
+            continue
+        x = (T[0, 0] * xyz[n, 0] + T[0, 1] * xyz[n, 1] + T[0, 2] * xyz[n, 2] + T[0, 3]) / z
+        y = (T[1, 0] * xyz[n, 0] + T[1, 1] * xyz[n, 1] + T[1, 2] * xyz[n, 2] + T[1, 3]) / z
+        u, v = K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]
+        longest = max(sigma[n, 0], sigma[n, 1], sigma[n, 2]) / z
+        reach_u = REACH * np.sqrt(LOW_PASS_PX2 + (length[0] * longest) ** 2)
+        reach_v = REACH * np.sqrt(LOW_PASS_PX2 + (length[1] * longest) ** 2)
+        if not (-reach_u < u < size_px[0] + reach_u and -reach_v < v < size_px[1] + reach_v):
+            continue
+        fx, fy = K[0, 0] / z, K[1, 1] / z
         slope_x = min(max(x, -widest[0]), widest[0])
         slope_y = min(max(y, -widest[1]), widest[1])
         w, a, b, c = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
@@ -550,24 +505,80 @@ def _project(
             uv += du * dv
             vv += dv * dv
         det = uu * vv - uv * uv
-        out[m, 0], out[m, 1] = K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]
+        out[m, 0], out[m, 1] = u, v
         out[m, 2], out[m, 3], out[m, 4] = vv / det, -uv / det, uu / det
         out[m, 5], out[m, 6] = REACH * np.sqrt(uu), REACH * np.sqrt(vv)
+        out[m, 7], out[m, 8], out[m, 9] = opacity[n], rgb[n, 0], rgb[n, 1]
+        out[m, 10], out[m, 11] = rgb[n, 2], z
+        rows[m] = n
+        m += 1
+    return m
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _span(middle: float, reach: float, size: int) -> tuple[int, int]:
-    return max(int(np.ceil(middle - reach)), 0), min(int(np.floor(middle + reach)) + 1, size)
+def _span(middle: float, reach: float, first: int, end: int) -> tuple[int, int]:
+    return max(int(np.ceil(middle - reach)), first), min(int(np.floor(middle + reach)) + 1, end)
+
+
+TILE_PX = 64
+"""Side of the squares that an image is drawn in: of one all pixels and shares stay in the cache."""
 
 
 @njit(cache=True, nogil=True)
-def _pixels_reached(flat: F32, w: int, h: int) -> int:
-    count = 0
-    for n in range(flat.shape[0]):
-        first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
-        first, last = _span(flat[n, 0], flat[n, 5], w)
-        count += max(last_row - first_row, 0) * max(last - first, 0)
-    return count
+def _tiled(flat: F32, w: int, h: int) -> tuple[I64, I32, int]:
+    """The tiles, row by row, of the Gaussians ``flat`` (M, 12)."""
+    across, down = -(-w // TILE_PX), -(-h // TILE_PX)
+    first, reached = np.zeros(across * down + 2, np.int64), np.zeros(across * down, np.int64)
+    items = np.empty(0, np.int32)
+    for turn in range(2):  # count, then fill
+        for n in range(len(flat)):
+            top, bottom = _span(flat[n, 1], flat[n, 6], 0, h)
+            left, right = _span(flat[n, 0], flat[n, 5], 0, w)
+            if top >= bottom or left >= right:
+                continue
+            for y in range(top // TILE_PX, (bottom - 1) // TILE_PX + 1):
+                rows = min(bottom, (y + 1) * TILE_PX) - max(top, y * TILE_PX)
+                for x in range(left // TILE_PX, (right - 1) // TILE_PX + 1):
+                    tile = y * across + x
+                    if turn == 0:
+                        cols = min(right, (x + 1) * TILE_PX) - max(left, x * TILE_PX)
+                        reached[tile] += rows * cols
+                        first[tile + 2] += 1
+                    else:
+                        items[first[tile + 1]] = n
+                        first[tile + 1] += 1
+        if turn == 0:
+            first = np.cumsum(first)
+            items = np.empty(first[-1], np.int32)
+    return first[:-1], items, reached.max()
+
+
+DIGIT_BITS = 11
+
+
+@njit(cache=True, nogil=True)
+def _sort(flat: F32, items: I32) -> None:
+    """Put Gaussians in order of depth, those equally near, of which flat ground has many, in their
+    own order on every machine: by digits of the bits of these positive numbers."""
+    depth = np.empty(len(items), np.float32)
+    for k in range(len(items)):
+        depth[k] = flat[items[k], 11]
+    keys = depth.view(np.uint32)
+    keys -= keys.min() if len(keys) else np.uint32(0)
+    most, shift, sorted_items = keys.max() if len(keys) else np.uint32(0), 0, items
+    other_keys, other = keys.copy(), items.copy()
+    while most >> shift:
+        place = np.zeros((1 << DIGIT_BITS) + 1, np.int64)
+        for key in keys:
+            place[((key >> shift) & ((1 << DIGIT_BITS) - 1)) + 1] += 1
+        place = np.cumsum(place)
+        for k in range(len(keys)):
+            digit = (keys[k] >> shift) & ((1 << DIGIT_BITS) - 1)
+            other_keys[place[digit]], other[place[digit]] = keys[k], sorted_items[k]
+            place[digit] += 1
+        keys, other_keys, sorted_items, other = other_keys, keys, other, sorted_items
+        shift += DIGIT_BITS
+    items[:] = sorted_items
 
 
 FAINTEST = 5.6
@@ -577,8 +588,6 @@ _FADING = np.exp(-FAINTEST * np.arange(1025) / 1024).astype(np.float32)
 FADING = np.column_stack([_FADING[:-1], np.diff(_FADING)])
 """(1024, 2) how much a Gaussian hides so many 1024ths of FAINTEST from its middle, and what the
 next one differs by."""
-
-NO_SHARES = np.zeros(0, np.float32)
 
 
 @njit(cache=True, nogil=True)
@@ -591,37 +600,40 @@ def _alpha(far: float, opacity: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: float) -> None:
-    """Draw Gaussians one behind the other.
+def _blend(
+    flat: F32, items: I32, top: int, left: int, h: int, w: int, light: F32, shares: F32
+) -> None:  # fmt: skip
+    """Draw Gaussians one behind the other in a tile of (h, w) pixels from row ``top`` and column
+    ``left`` of the image.
 
-    ``pixels`` (h, w, 4) are colours over black and the share of light that comes from behind; one
-    with less than ``done`` of it takes no more. ``shares`` takes the share of each Gaussian
-    of the light of each pixel that it reaches; NO_SHARES are not kept.
+    ``light`` (TILE_PX**2, 4) is made: colours over black and the share of light that comes from
+    behind; a pixel with less than DONE of it takes no more. ``shares`` takes the share of each
+    Gaussian of the light of each pixel that it reaches; none, of none, are not kept.
     """
-    (h, w), light = pixels.shape[:2], pixels.reshape(-1, 4)
     keeps = shares.size > 0
     scale = np.float32(1024.0 / FAINTEST)
     half = scale * np.float32(0.5)
-    least, enough = np.float32(SMALLEST_ALPHA), np.float32(done)
+    least, enough = np.float32(SMALLEST_ALPHA), np.float32(DONE)
     zero, end = np.float32(0.0), np.float32(1024.0)
     at, one = np.uint64(0), np.uint64(1)  # without a sign none counts from the end
-    for n in range(flat.shape[0]):
+    light[:, :3], light[:, 3] = 0.0, 1.0
+    for n in items:
         u, v, reach_u, reach_v = flat[n, 0], flat[n, 1], flat[n, 5], flat[n, 6]
         uu, uv, vv = half * flat[n, 2], scale * flat[n, 3], half * flat[n, 4]
-        first_row, last_row = _span(v, reach_v, h)
-        first, last = _span(u, reach_u, w)
-        red, green, blue = rgb[n, 0], rgb[n, 1], rgb[n, 2]
+        first_row, last_row = _span(v, reach_v, top, top + h)
+        first, last = _span(u, reach_u, left, left + w)
+        opacity, red, green, blue = flat[n, 7], flat[n, 8], flat[n, 9], flat[n, 10]
         for row in range(first_row, last_row):
             dv = np.float32(row) - v
             along, across = uv * dv, vv * dv * dv
-            p = np.uint64(row * w + first)
+            p = np.uint64((row - top) * TILE_PX + first - left)
             for col in range(first, last):
                 # Without branches: half of them would be guessed wrong.
                 du, before = np.float32(col) - u, light[p, 3]
                 far = (uu * du + along) * du + across
                 is_near = far < end  # also no NaN, nor what no integer holds
                 far = max(far, zero) if is_near else zero
-                alpha = _alpha(far, opacity[n])
+                alpha = _alpha(far, opacity)
                 share = alpha * before
                 share = share if is_near & (alpha >= least) & (before >= enough) else zero
                 light[p, 0] += share * red
@@ -635,7 +647,50 @@ def _blend(flat: F32, opacity: F32, rgb: F32, pixels: F32, shares: F32, done: fl
 
 
 @njit(cache=True, nogil=True)
-def _cover(flat: F32, opacity: F32, left: F32, done: float) -> None:
+def _draw(flat: F32, first: I64, items: I32, most: int, image: F32) -> None:
+    """Fill ``image`` (h, w, 4): colours over black and the share of light from behind."""
+    h, w = image.shape[:2]
+    light, none = np.empty((TILE_PX * TILE_PX, 4), np.float32), np.empty(0, np.float32)
+    across = -(-w // TILE_PX)
+    for tile in range(len(first) - 1):
+        top, left = tile // across * TILE_PX, tile % across * TILE_PX
+        rows, cols = min(TILE_PX, h - top), min(TILE_PX, w - left)
+        some = items[first[tile] : first[tile + 1]]
+        _sort(flat, some)
+        _blend(flat, some, top, left, rows, cols, light, none)
+        for row in range(rows):
+            for col in range(cols):
+                image[top + row, left + col] = light[row * TILE_PX + col]
+
+
+@njit(cache=True, nogil=True)
+def _errors(flat: F32, first: I64, items: I32, most: int, bgra: U8) -> F32:
+    """(M, 4) of each Gaussian, sums over its pixels by its share of them: what an image has more of
+    red, green and blue than they show, and of these shares; holes do not count."""
+    h, w = bgra.shape[:2]
+    light = np.empty((TILE_PX * TILE_PX, 4), np.float32)
+    shares, sums = np.empty(max(most, 1), np.float32), np.zeros((len(flat), 4), np.float32)
+    across = -(-w // TILE_PX)
+    for tile in range(len(first) - 1):
+        top, left = tile // across * TILE_PX, tile % across * TILE_PX
+        rows, cols = min(TILE_PX, h - top), min(TILE_PX, w - left)
+        some = items[first[tile] : first[tile + 1]]
+        _sort(flat, some)
+        _blend(flat, some, top, left, rows, cols, light, shares)
+        for row in range(rows):
+            for col in range(cols):
+                p = row * TILE_PX + col
+                counts = bgra[top + row, left + col, 3] > 0 and light[p, 3] <= 1.0 - COVERED
+                for k in range(3):
+                    off = np.float32(bgra[top + row, left + col, 2 - k]) - light[p, k]
+                    light[p, k] = off if counts else 0.0
+                light[p, 3] = counts
+        _back(flat, some, top, left, rows, cols, light, shares, sums)
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _cover(flat: F32, left: F32, done: float) -> None:
     """What :func:`_blend` does to the share of light ``left`` (h, w), with branches: most pixels
     are soon covered."""
     (h, w), light = left.shape, left.reshape(-1)
@@ -646,8 +701,8 @@ def _cover(flat: F32, opacity: F32, left: F32, done: float) -> None:
     for n in range(flat.shape[0]):
         u, v, reach_u, reach_v = flat[n, 0], flat[n, 1], flat[n, 5], flat[n, 6]
         uu, uv, vv = half * flat[n, 2], scale * flat[n, 3], half * flat[n, 4]
-        first_row, last_row = _span(v, reach_v, h)
-        first, last = _span(u, reach_u, w)
+        first_row, last_row = _span(v, reach_v, 0, h)
+        first, last = _span(u, reach_u, 0, w)
         for row in range(first_row, last_row):
             dv = np.float32(row) - v
             along, across = uv * dv, vv * dv * dv
@@ -658,30 +713,34 @@ def _cover(flat: F32, opacity: F32, left: F32, done: float) -> None:
                     du = np.float32(col) - u
                     far = (uu * du + along) * du + across
                     if far < end:
-                        alpha = _alpha(max(far, zero), opacity[n])
+                        alpha = _alpha(max(far, zero), flat[n, 7])
                         if alpha >= least:
                             light[p] = before - alpha * before
                 p += one
 
 
 @njit(cache=True, nogil=True)
-def _back(flat: F32, error: F32, shares: F32) -> F32:
-    """(N, 4) sums of ``error`` (h, w, 3) over the pixels of each Gaussian by its share of them, and
-    of these shares; errors that are NaN do not count."""
-    h, w = error.shape[:2]
-    sums, at = np.zeros((flat.shape[0], 4), np.float32), 0
-    for n in range(flat.shape[0]):
-        first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
-        first, last = _span(flat[n, 0], flat[n, 5], w)
+def _back(
+    flat: F32, items: I32, top: int, left: int, h: int, w: int, error: F32, shares: F32, sums: F32
+) -> None:  # fmt: skip
+    """Add to ``sums`` those of the ``error`` (TILE_PX**2, 4) of a tile, by the ``shares`` that
+    :func:`_blend` found."""
+    at, one = np.uint64(0), np.uint64(1)
+    for n in items:
+        first_row, last_row = _span(flat[n, 1], flat[n, 6], top, top + h)
+        first, last = _span(flat[n, 0], flat[n, 5], left, left + w)
         red = green = blue = total = np.float32(0.0)
         for row in range(first_row, last_row):
-            for col in range(first, last):
+            p = np.uint64((row - top) * TILE_PX + first - left)
+            for _ in range(first, last):
                 share = shares[at]
-                at += 1
-                if share > 0.0 and not np.isnan(error[row, col, 0]):
-                    red += share * error[row, col, 0]
-                    green += share * error[row, col, 1]
-                    blue += share * error[row, col, 2]
-                    total += share
-        sums[n, 0], sums[n, 1], sums[n, 2], sums[n, 3] = red, green, blue, total
-    return sums
+                red += share * error[p, 0]
+                green += share * error[p, 1]
+                blue += share * error[p, 2]
+                total += share * error[p, 3]
+                at += one
+                p += one
+        sums[n, 0] += red
+        sums[n, 1] += green
+        sums[n, 2] += blue
+        sums[n, 3] += total
