@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 
 from recon.types import F32, F64, I64, Bool
 
@@ -25,30 +25,32 @@ TIE = 1e-6
 """Weight of the nearest known height, which alone holds cells that touch none."""
 
 
-def between(height_m: F32, fixed: Bool, wanted: Bool, cell_m: float) -> F32:
-    """``height_m`` (rows, cols) with the ``wanted`` cells filled from the ``fixed`` ones.
+def between(values: F32, fixed: Bool, wanted: Bool, cell_m: float) -> F32:
+    """``values`` (rows, cols) or (rows, cols, channels) with the ``wanted`` cells filled from the
+    ``fixed`` ones.
 
     Cells that are neither take no part. Without fixed cells nothing is filled.
     """
-    out: F32 = height_m.copy()
+    out: F32 = values.copy()
     wanted = wanted & ~fixed
     if not fixed.any() or not wanted.any():
         return out
     shrink = max(1, round(WORKING_CELL_M / cell_m))
     shrink = max(shrink, math.ceil(math.sqrt(wanted.sum() / MAX_COARSE_CELLS)))
-    total, count = _blocks(np.where(fixed, height_m, 0.0), shrink), _blocks(fixed, shrink)
+    channels = np.moveaxis(values.reshape(*fixed.shape, -1), 2, 0)
+    count = _blocks(fixed, shrink)
     is_known = count > 0
-    coarse = np.divide(total, count, out=np.zeros_like(total), where=is_known)
+    coarse = np.stack([_blocks(np.where(fixed, one, 0.0), shrink) for one in channels])
+    coarse = np.divide(coarse, count, out=np.zeros_like(coarse), where=is_known)
     is_asked = (_blocks(wanted, shrink) > 0) & ~is_known
     distance, near = ndimage.distance_transform_edt(~fixed, return_indices=True)
-    nearest = height_m[tuple(near)]
-    coarse[is_asked] = _solved(coarse, is_known, is_asked)
-    rows, cols = np.nonzero(wanted)
-    smooth = _interpolated(coarse, is_known | is_asked, rows, cols, shrink)
-    there = near[0][wanted], near[1][wanted]
-    at_fixed = _interpolated(coarse, is_known | is_asked, *there, shrink)
+    coarse[:, is_asked] = _solved(coarse, is_known, is_asked)
+    there = near[:, wanted]
+    places = np.concatenate([np.nonzero(wanted), there], axis=1)
+    smooth, at_fixed = np.split(_interpolated(coarse, is_known | is_asked, places, shrink), 2, 1)
     fade = np.exp(-distance[wanted] * cell_m / FADE_M)
-    out[wanted] = smooth + (nearest[wanted] - at_fixed) * fade
+    filled = smooth + (channels[:, there[0], there[1]] - at_fixed) * fade
+    out[wanted] = filled.T.reshape(out[wanted].shape)
     return out
 
 
@@ -61,11 +63,12 @@ def _blocks(values: F32 | Bool, shrink: int) -> F64:
 
 
 def _solved(coarse: F64, is_known: Bool, is_asked: Bool) -> F64:
-    """Heights of the asked cells: each the mean of its neighbours that are known or asked."""
-    number: I64 = np.full(coarse.shape, -1, np.int64)
+    """Values of the asked cells in each channel of ``coarse`` (K, rows, cols): each the mean of its
+    neighbours that are known or asked."""
+    number: I64 = np.full(is_asked.shape, -1, np.int64)
     number[is_asked] = np.arange(is_asked.sum())
     near = ndimage.distance_transform_edt(~is_known, return_distances=False, return_indices=True)
-    right = TIE * coarse[tuple(near)][is_asked]
+    right = TIE * coarse[:, near[0], near[1]][:, is_asked].T
     diagonal = np.full(len(right), TIE)
     rows, cols = [], []
     for axis in (0, 1):
@@ -74,28 +77,27 @@ def _solved(coarse: F64, is_known: Bool, is_asked: Bool) -> F64:
         ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
         for one, two in ((tuple(behind), tuple(ahead)), (tuple(ahead), tuple(behind))):
             own, other = number[one].ravel(), number[two].ravel()
-            known, height = is_known[two].ravel(), coarse[two].ravel()
+            known = is_known[two].ravel()
             joined = (own >= 0) & (other >= 0)
             held = (own >= 0) & known
-            np.add.at(diagonal, own[joined | held], 1.0)
-            np.add.at(right, own[held], height[held])
+            diagonal[own[joined | held]] += 1.0  # no cell has two neighbours on one side
+            right[own[held]] += coarse[:, two[0], two[1]].reshape(len(coarse), -1)[:, held].T
             rows.append(own[joined])
             cols.append(other[joined])
     r, c = np.concatenate(rows), np.concatenate(cols)
     size = (len(right), len(right))
     A = sparse.diags(diagonal).tocsc() - sparse.csc_matrix((np.ones(len(r)), (r, c)), size)
-    return np.asarray(spsolve(A, right))
+    return np.asarray(splu(A.tocsc()).solve(right).T) if len(right) else right.T
 
 
-def _interpolated(
-    coarse: F64, is_there: Bool, rows: I64, cols: I64,
-    shrink: int,
-) -> F64:  # fmt: skip
-    """Coarse heights between the middles of their cells, of those that are there alone."""
-    low = float(coarse[is_there].mean())
-    at = np.stack([(rows + 0.5) / shrink - 0.5, (cols + 0.5) / shrink - 0.5])
-    value, weight = (
-        ndimage.map_coordinates(one, at, order=1, mode="nearest")
-        for one in (np.where(is_there, coarse - low, 0.0), is_there.astype(np.float64))
-    )
-    return np.asarray(value / np.maximum(weight, 1e-6) + low)
+def _interpolated(coarse: F64, is_there: Bool, places: I64, shrink: int) -> F64:
+    """Coarse values (K, N) at ``places`` (2, N) between the middles of their cells, of those that
+    are there alone."""
+    at = (places + 0.5) / shrink - 0.5
+    low = coarse[:, is_there].mean(axis=1)
+    value = [
+        ndimage.map_coordinates(np.where(is_there, one - middle, 0.0), at, order=1, mode="nearest")
+        for one, middle in zip(coarse, low, strict=True)
+    ]
+    weight = ndimage.map_coordinates(is_there.astype(np.float64), at, order=1, mode="nearest")
+    return np.asarray(value / np.maximum(weight, 1e-6) + low[:, None])

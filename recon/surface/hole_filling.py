@@ -90,12 +90,12 @@ def completed(raster: Raster, low_m: F32, inside: Bool, unsure: Bool) -> Raster:
     below = is_open[parts]
     height = np.where(below, low_m, height).astype(np.float32)
     rgb = np.where(wanted[..., None], raster.rgb[tuple(near)], raster.rgb)
+    values = np.dstack([raster.height_m, raster.rgb.astype(np.float32)])
     for cells, fixed in ((below, level), (rest & ~below, known)):
+        filled = between(values, fixed, cells, cell_m)[cells]
+        rgb[cells] = np.clip(filled[:, 1:], 0, 255)
         if fixed is known:
-            height[cells] = between(raster.height_m, known, cells, cell_m)[cells]
-        for k in range(3):
-            channel = between(raster.rgb[..., k].astype(np.float32), fixed, cells, cell_m)
-            rgb[cells, k] = np.clip(channel[cells], 0, 255)
+            height[cells] = filled[:, 0]
     height = np.where(wanted, height, raster.height_m[tuple(near)]).astype(np.float32)
     middle = float(np.median(raster.height_m[known]))
     most = cv2.medianBlur(height - middle, 5) + middle
