@@ -180,13 +180,19 @@ def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iteration
     """Slots after belief propagation and iterated conditional modes."""
     (faces, slots), edges = view.shape, neighbours.shape[1]
     back = np.full((faces, edges), -1, np.int32)  # which of the neighbour's edges leads here
+    same = np.full((faces, edges, slots), -1, np.int32)  # own slot of each view of the neighbour
     for f in range(faces):
         for e in range(edges):
             g = neighbours[f, e]
-            if g >= 0:
-                for d in range(edges):
-                    if neighbours[g, d] == f:
-                        back[f, e] = d
+            if g < 0:
+                continue
+            for d in range(edges):
+                if neighbours[g, d] == f:
+                    back[f, e] = d
+            for j in range(slots):
+                for k in range(slots):
+                    if view[g, j] >= 0 and view[f, k] == view[g, j]:
+                        same[f, e, j] = k
     message = np.zeros((faces, edges, slots), np.float32)  # to (f) over its edge e
     belief = np.empty(slots, np.float32)
     is_due = view[:, 0] >= 0
@@ -212,10 +218,9 @@ def _propagated(view: I32, cost: F32, neighbours: I32, penalty: float, iteration
                 for j in range(slots):
                     if view[g, j] < 0:
                         break
-                    value = np.float32(penalty)
-                    for k in range(slots):
-                        if view[f, k] == view[g, j]:
-                            value = min(value, belief[k] - least)
+                    value, k = np.float32(penalty), same[f, e, j]
+                    if k >= 0:
+                        value = min(value, belief[k] - least)
                     change = (1.0 - DAMPING) * (value - message[g, back[f, e], j])
                     message[g, back[f, e], j] += change
                     if abs(change) > SETTLED:
