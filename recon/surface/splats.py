@@ -20,8 +20,9 @@ from numba import njit
 
 from recon import se3
 from recon.camera_model import rays
-from recon.mapping.cloud_fusion import BITS, ISLAND_POINTS, ISLAND_SHIFT, pieces
+from recon.mapping.cloud_fusion import ISLAND_POINTS, ISLAND_SHIFT, pieces
 from recon.mapping.free_space import seen_through, spread
+from recon.mapping.voxel_map import find_slot, rehash, voxel_key
 from recon.parallel import run_parallel, threads
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView, rays_onto
@@ -322,37 +323,71 @@ def _merged(found: Sequence[_Pixels], depths: Sequence[DepthMap]) -> list[I64]:
         for name in ("places_m", "sigma_m", "side_px", "footprint_m", "opacity")
     )
     seen = np.where(opacity > SINGLE + 1e-3, 2, 1).astype(np.uint8)
-    cloud = PointCloud(places_m, np.zeros((len(seen), 3), np.uint8), sigma_m, seen)
-    kept = np.flatnonzero(~seen_through(cloud, spread(depths))) if len(seen) else first[:0]
-    if len(kept):
-        cell_m = MERGED * float(np.median(footprint_m[kept]))
-        stay = []
-        for side in np.unique(side_px):
-            some = kept[side_px[kept] == side]
-            cell = _cells(places_m[some], cell_m * side)
-            order = np.lexsort((sigma_m[some], cell))
-            stay.append(some[order[np.diff(cell[order], prepend=-1) != 0]])
-        kept = np.sort(np.concatenate(stay))
-        is_lone = _is_lone(places_m[kept], side_px[kept] ** 2, cell_m * (1 << ISLAND_SHIFT))
-        kept = kept[~is_lone]
-    at = np.searchsorted(kept, first)
-    return [kept[a:b] - n for a, b, n in zip(at[:-1], at[1:], first[:-1], strict=True)]
+    cell_m = MERGED * float(np.median(footprint_m)) if len(seen) else 1.0
+    cell, cells, kept = np.empty(len(seen), np.int32), 0, [first[:0]]
+    for side in np.unique(side_px):
+        some = np.flatnonzero(side_px == side)
+        number, keys = _cells(places_m[some], cell_m * float(side))
+        cell[some], cells = number + cells, cells + len(keys)
+    rest, is_done = np.arange(len(seen)), np.zeros(len(seen), np.bool_)
+    while len(rest):  # only the best of each cell are looked at, until none is seen through
+        best = _least(rest, cell, sigma_m, cells)
+        black = np.zeros((len(best), 3), np.uint8)
+        cloud = PointCloud(places_m[best], black, sigma_m[best], seen[best])
+        is_false = seen_through(cloud, spread(depths))
+        kept.append(best[~is_false])
+        again = np.zeros(cells, np.bool_)
+        again[cell[best[is_false]]], is_done[best] = True, True
+        rest = rest[again[cell[rest]] & ~is_done[rest]]
+    stay = np.sort(np.concatenate(kept))
+    if len(stay):
+        is_lone = _is_lone(places_m[stay], side_px[stay] ** 2, cell_m * (1 << ISLAND_SHIFT))
+        stay = stay[~is_lone]
+    at = np.searchsorted(stay, first)
+    return [stay[a:b] - n for a, b, n in zip(at[:-1], at[1:], first[:-1], strict=True)]
 
 
-def _cells(xyz_m: F32, cell_m: float) -> I64:
-    """(N,) keys of the cells that places lie in."""
-    cell = np.floor(xyz_m / cell_m).astype(np.int64)
-    i, j, k = (cell - cell.min(axis=0) + 1).T
-    return np.asarray((i << 2 * BITS) | (j << BITS) | k, np.int64)
+@njit(cache=True, nogil=True)
+def _cells(xyz: F32, cell_m: float) -> tuple[I32, I64]:
+    """(N,) number of the cell that each place lies in, and (C,) the cells' keys."""
+    keys, ids = np.full(1 << 16, -1, np.int64), np.zeros(1 << 16, np.int32)
+    number, count = np.empty(len(xyz), np.int32), 0
+    for n in range(len(xyz)):
+        key = voxel_key(xyz[n, 0], xyz[n, 1], xyz[n, 2], 1.0 / cell_m)
+        slot = find_slot(keys, key)
+        if keys[slot] == -1:
+            keys[slot], ids[slot] = key, count
+            count += 1
+        number[n] = ids[slot]
+        if 2 * count > len(keys):
+            keys, ids = rehash(keys, ids, 2 * len(keys))
+    out = np.full(count, -1, np.int64)
+    for slot in range(len(keys)):
+        if keys[slot] != -1:
+            out[ids[slot]] = keys[slot]
+    return number, out
+
+
+@njit(cache=True, nogil=True)
+def _least(rows: I64, cell: I32, sigma_m: F32, cells: int) -> I64:
+    """The row of each cell with the least sigma, the first one of equals, rising."""
+    best = np.full(cells, -1, np.int64)
+    for n in rows:
+        held = best[cell[n]]
+        if held < 0 or sigma_m[n] < sigma_m[held]:
+            best[cell[n]] = n
+    return np.sort(best[best >= 0])
 
 
 def _is_lone(xyz_m: F32, pixels: F32, cell_m: float) -> Bool:
     """(N,) those in pieces of surface of fewer ``pixels`` than ISLAND_POINTS, by cells that
     touch."""
-    cells, cell = np.unique(_cells(xyz_m - xyz_m.min(axis=0), cell_m), return_inverse=True)
-    part = pieces(cells)[cell]
-    count = np.bincount(part, pixels)
-    return np.asarray((count < min(ISLAND_POINTS, count.max()))[part])
+    cell, keys = _cells(xyz_m, cell_m)
+    order = np.argsort(keys)
+    part = np.empty(len(keys), np.int64)
+    part[order] = pieces(keys[order])
+    count = np.bincount(part[cell], pixels)
+    return np.asarray((count < min(ISLAND_POINTS, count.max()))[part][cell])
 
 
 def _fillings(
@@ -462,14 +497,13 @@ def _projected(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tupl
     return rows[:count], flat[:count]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _project(
     xyz: F32, q: F32, sigma: F32, opacity: F32, rgb: F32, K: F64, T: F64,
     size_px: tuple[int, int], widest: tuple[float, float], rows: I32, out: F32,
 ) -> int:  # fmt: skip
     """Fill ``rows`` and ``out``; of how many. A bound of how far each reaches in the image says
     which."""
-    R = np.empty((3, 3))
     length = K[0, 0] * np.sqrt(1.0 + widest[0] ** 2), K[1, 1] * np.sqrt(1.0 + widest[1] ** 2)
     m = 0
     for n in range(len(xyz)):
@@ -487,20 +521,24 @@ def _project(
         fx, fy = K[0, 0] / z, K[1, 1] / z
         slope_x = min(max(x, -widest[0]), widest[0])
         slope_y = min(max(y, -widest[1]), widest[1])
-        w, a, b, c = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
-        R[0, 0], R[1, 1], R[2, 2] = b * b + c * c, a * a + c * c, a * a + b * b
-        R[0, 1], R[0, 2], R[1, 2] = a * b - w * c, a * c + w * b, b * c - w * a
-        R[1, 0], R[2, 0], R[2, 1] = a * b + w * c, a * c - w * b, b * c + w * a
-        for k in range(3):
-            for j in range(3):
-                R[k, j] = 1.0 - 2.0 * R[k, j] if k == j else 2.0 * R[k, j]
+        # What a step along each axis of the world moves in the image; then along its own axes.
+        u0, v0 = fx * (T[0, 0] - slope_x * T[2, 0]), fy * (T[1, 0] - slope_y * T[2, 0])
+        u1, v1 = fx * (T[0, 1] - slope_x * T[2, 1]), fy * (T[1, 1] - slope_y * T[2, 1])
+        u2, v2 = fx * (T[0, 2] - slope_x * T[2, 2]), fy * (T[1, 2] - slope_y * T[2, 2])
+        w, a, b, c = (
+            np.float64(q[n, 0]),
+            np.float64(q[n, 1]),
+            np.float64(q[n, 2]),
+            np.float64(q[n, 3]),
+        )
         uu, uv, vv = LOW_PASS_PX2, 0.0, LOW_PASS_PX2
-        for k in range(3):
-            s = sigma[n, k]
-            dx = s * (T[0, 0] * R[0, k] + T[0, 1] * R[1, k] + T[0, 2] * R[2, k])
-            dy = s * (T[1, 0] * R[0, k] + T[1, 1] * R[1, k] + T[1, 2] * R[2, k])
-            dz = s * (T[2, 0] * R[0, k] + T[2, 1] * R[1, k] + T[2, 2] * R[2, k])
-            du, dv = fx * (dx - slope_x * dz), fy * (dy - slope_y * dz)
+        for s, r0, r1, r2 in (
+            (sigma[n, 0], 0.5 - b * b - c * c, a * b + w * c, a * c - w * b),
+            (sigma[n, 1], a * b - w * c, 0.5 - a * a - c * c, b * c + w * a),
+            (sigma[n, 2], a * c + w * b, b * c - w * a, 0.5 - a * a - b * b),
+        ):
+            du = 2.0 * s * (r0 * u0 + r1 * u1 + r2 * u2)
+            dv = 2.0 * s * (r0 * v0 + r1 * v1 + r2 * v2)
             uu += du * du
             uv += du * dv
             vv += dv * dv
