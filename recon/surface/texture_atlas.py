@@ -262,7 +262,7 @@ def _take(small: U8, image: U8, done: Bool) -> None:  # pragma: no cover - compi
                     image[row, col, k] = small[row // 2, col // 2, k]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sample(
     images: Images, number: int, u: float, v: float, out: F64
 ) -> float:  # pragma: no cover - compiled
@@ -287,7 +287,7 @@ def sample(
     return alpha
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_view(
     images: Images, number: int, x: float, y: float, z: float, weight: float, colour: F64, out: F64
 ) -> float:  # pragma: no cover - compiled
@@ -307,8 +307,7 @@ class _Mixed(NamedTuple):
     """The views that are mixed in one triangle; room for a texel's colours."""
 
     views: I32  # (3 B + 1,) each once
-    slots: I32  # (3 B + 1,) which of these the corners' views and its own are; -1: it sees none
-    shares: F64  # (3 B + 1,) of the views
+    shares: F64  # (3 B + 1, 3) of these views at the corners
     colour: F64  # (3,)
     total: F64  # (3,)
 
@@ -319,46 +318,42 @@ def _gather(
 ) -> int:  # pragma: no cover - compiled
     """Find the views that are mixed in triangle ``f``; how many."""
     blended, count = palette.fade_view.shape[1], 0
-    for n in range(len(mixed.slots)):
-        view = surface.label[f]
-        if n < 3 * blended:
-            view = palette.fade_view[surface.faces[f, n // blended], n % blended]
-        mixed.slots[n] = -1
+    for n in range(len(mixed.views)):
+        vertex = surface.faces[f, min(n // blended, 2)]
+        is_own = n == 3 * blended
+        view = surface.label[f] if is_own else palette.fade_view[vertex, n % blended]
         for one in surface.seen[f]:
             if one == view and view >= 0:
                 slot = 0
                 while slot < count and mixed.views[slot] != view:
                     slot += 1
-                mixed.views[slot], mixed.slots[n] = view, slot
-                count = max(count, slot + 1)
+                if slot == count:
+                    mixed.views[slot], mixed.shares[slot] = view, 0.0
+                    count += 1
+                if is_own:
+                    mixed.shares[slot] += 1e-2  # should no other show anything
+                else:
+                    mixed.shares[slot, n // blended] += palette.fade_share[vertex, n % blended]
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _texel(
     f: int, a: float, b: float, c: float, surface: Painted, palette: Palette, mixed: _Mixed,
     count: int, out: U8,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """The colour of the place with weights a, b, c of the corners of triangle ``f``."""
-    blended, shares = palette.fade_share.shape[1], mixed.shares
     p, q, r = surface.faces[f, 0], surface.faces[f, 1], surface.faces[f, 2]
-    shares[:count] = 0.0
-    for n in range(len(mixed.slots)):
-        if mixed.slots[n] >= 0:
-            share = 1e-2  # the own view, should no other show anything
-            if n < 3 * blended:
-                share = a if n < blended else b if n < 2 * blended else c
-                share *= palette.fade_share[surface.faces[f, n // blended], n % blended]
-            shares[mixed.slots[n]] += share
     one, two, three = surface.vertices[p], surface.vertices[q], surface.vertices[r]
     x = a * one[0] + b * two[0] + c * three[0]
     y = a * one[1] + b * two[1] + c * three[1]
     z = a * one[2] + b * two[2] + c * three[2]
     mixed.total[:] = whole = 0.0
     for n in range(count):
-        if shares[n] >= 1e-2:
+        share = a * mixed.shares[n, 0] + b * mixed.shares[n, 1] + c * mixed.shares[n, 2]
+        if share >= 1e-2:
             view = mixed.views[n]
-            whole += add_view(palette.images, view, x, y, z, shares[n], mixed.colour, mixed.total)
+            whole += add_view(palette.images, view, x, y, z, share, mixed.colour, mixed.total)
     rgb = palette.rgb
     for k in range(3):
         if whole > 1e-3:
@@ -368,7 +363,7 @@ def _texel(
         out[k] = np.uint8(min(max(value + 0.5, 0.0), 255.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _on_longest_edge(
     uv: F64, x: float, y: float
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
@@ -388,7 +383,7 @@ def _on_longest_edge(
     return along, 0.0, 1.0 - along
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _paint(
     begin: int, end: int, painted: I64, margin: float, surface: Painted, palette: Palette,
     image: U8, done: Bool,
@@ -398,9 +393,7 @@ def _paint(
     width = done.shape[1]
     vertices, faces, T = surface.vertices, surface.faces, palette.images.T
     most = 3 * palette.fade_view.shape[1] + 1
-    mixed = _Mixed(
-        np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(3), np.empty(3)
-    )
+    mixed = _Mixed(np.empty(most, np.int32), np.empty((most, 3)), np.empty(3), np.empty(3))
     depth, least = np.empty(3), np.empty(3)
     for f in painted:
         uv, own = surface.uv[f], surface.label[f]

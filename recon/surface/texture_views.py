@@ -97,21 +97,12 @@ def look(
         px = projected(view, vertices)
         inside = _inside(px, view)
         inside[inside] = _free(reach, view, vertices[inside], tolerance)
-        faces = np.flatnonzero(inside[mesh.faces].all(axis=1))
-        towards = view.T_world_camera[:3, 3] - middle[faces]
-        facing = np.einsum("ij,ij->i", normal[faces], towards)
-        is_seen = facing > MIN_COSINE * np.linalg.norm(towards, axis=1)
-        is_seen[is_seen] = _free(reach, view, middle[faces[is_seen]], tolerance)
-        faces, facing = faces[is_seen], facing[is_seen]
-        middle_px = projected(view, middle[faces])
-        ahead = -towards[is_seen] @ view.T_world_camera[:3, 2]
-        resolution = np.sqrt(view.K[0, 0] * view.K[1, 1] * facing / ahead**3)
-        places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
-        colour, seen = _mean_colour(view.bgra, places)
-        good = seen & np.isfinite(resolution)
-        _insert_all(
-            out.view, out.px_per_m, out.bgr, faces[good], number,
-            resolution[good].astype(np.float32), colour[good],
+        rows = _facing(mesh.faces, inside, normal, middle, view.T_world_camera)
+        rows = rows[_free(reach, view, middle[rows], tolerance)]
+        places = np.concatenate([px[mesh.faces[rows]], projected(view, middle[rows])[:, None]], 1)
+        _see(
+            rows, places, normal, middle, view.bgra, view.K, view.T_world_camera, number, out.view,
+            out.px_per_m, out.bgr,
         )  # fmt: skip
     progress(1.0)
     return out
@@ -248,28 +239,56 @@ def doubled_area(px: F64) -> F64:
     return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _mean_colour(bgra: U8, px: F64) -> tuple[F32, Bool]:
-    """Mean colour (N, 3) of (N, P, 2) places by nearest pixel, and where half had colour."""
-    if not len(px):
-        return np.zeros((0, 3), np.float32), np.zeros(0, np.bool_)
-    h, w = bgra.shape[:2]
-    at = np.rint(px).astype(np.int64)
-    samples = bgra[np.clip(at[..., 1], 0, h - 1), np.clip(at[..., 0], 0, w - 1)]
-    known = samples[..., 3] > 0
-    count = known.sum(axis=1)
-    total = (samples[..., :3] * known[..., None]).sum(axis=1, dtype=np.float32)
-    colour = (total / np.maximum(count, 1)[:, None]).astype(np.float32)
-    return colour, 2 * count >= px.shape[1]
+@njit(cache=True, nogil=True)
+def _facing(faces: I32, inside: Bool, normal: F64, middle: F64, T: F64) -> I64:
+    """The triangles whose corners are all ``inside`` (V,) and that face the camera."""
+    rows: I64 = np.empty(len(faces), np.int64)
+    count = 0
+    for f in range(len(faces)):
+        if not (inside[faces[f, 0]] and inside[faces[f, 1]] and inside[faces[f, 2]]):
+            continue
+        facing = squared = 0.0
+        for k in range(3):
+            towards = T[k, 3] - middle[f, k]
+            facing += normal[f, k] * towards
+            squared += towards**2
+        if facing > MIN_COSINE * np.sqrt(squared):
+            rows[count] = f
+            count += 1
+    return rows[:count]
 
 
 @njit(cache=True, nogil=True)
-def _insert_all(
-    view: I32, px: F32, bgr: F32, faces: I64, number: int, resolution: F32, colour: F32
-) -> None:
-    """Put one view's sightings into the rows of their faces."""
-    for n in range(len(faces)):
-        f = faces[n]
-        insert(view[f], px[f], bgr[f], number, resolution[n], colour[n])
+def _see(
+    rows: I64, places: F64, normal: F64, middle: F64, bgra: U8, K: F64, T: F64, number: int,
+    view: I32, px: F32, bgr: F32,
+) -> None:  # fmt: skip
+    """Put sightings of triangles by a view into their rows: the mean colour of ``places`` (N, P, 2)
+    by nearest pixel, where half of these have one."""
+    h, w, count = bgra.shape[0], bgra.shape[1], places.shape[1]
+    colour = np.empty(3)
+    for n in range(len(rows)):
+        f = rows[n]
+        colour[:] = known = 0.0
+        for k in range(count):
+            if not np.isfinite(places[n, k, 0]):
+                continue
+            col = min(max(int(np.rint(places[n, k, 0])), 0), w - 1)
+            row = min(max(int(np.rint(places[n, k, 1])), 0), h - 1)
+            if bgra[row, col, 3] > 0:
+                known += 1.0
+                for c in range(3):
+                    colour[c] += bgra[row, col, c]
+        facing = ahead = 0.0
+        for k in range(3):
+            towards = T[k, 3] - middle[f, k]
+            facing += normal[f, k] * towards
+            ahead -= towards * T[k, 2]
+        if 2.0 * known >= count and ahead > 0.0:
+            resolution = np.float32(np.sqrt(K[0, 0] * K[1, 1] * facing / ahead**3))
+            for c in range(3):
+                colour[c] /= known
+            insert(view[f], px[f], bgr[f], number, resolution, colour)
 
 
 @njit(cache=True, nogil=True)
