@@ -13,6 +13,7 @@ from service.errors import OutsideError
 
 EXTRAS = {
     "distributed": "cluster",
+    "gsplat": "splat",
     "onnx": "onnx",
     "onnxruntime": "onnx",
     "pyulog": "logs",

@@ -58,6 +58,10 @@ def export(
     ] = None,
     tile_points: TilePoints = 20_000_000,
     scheduler: Scheduler = None,
+    train_steps: Annotated[
+        int,
+        typer.Option(min=0, help="splat: steps of training, by gsplat on a CUDA device"),
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
@@ -76,7 +80,7 @@ def export(
     with refusing("export"):
         options = ExportOptions(
             voxel_m, cell_m, contour_m, strict, video, stored, _epoch_ns(video_epoch),
-            vertical_datum, to_datum, tile_points, scheduler,
+            vertical_datum, to_datum, tile_points, scheduler, train_steps,
         )  # fmt: skip
     kinds = list(dict.fromkeys(to))
     with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:

@@ -10,9 +10,10 @@ import numpy as np
 
 from recon import se3
 from recon.parallel import run_parallel
+from recon.surface.splat_training import trained
 from recon.surface.splats import Splats, gaussians, joined, splats_of, steps
 from recon.types import F32, F64, Bool
-from service.errors import InputError, refusing
+from service.errors import InputError, OutsideError, refusing
 from service.offline.exports.clouds import VOXELS_MARGIN_M, ply_head
 from service.offline.exports.images import resized, shared_images
 from service.offline.exports.model import LARGEST_FACES, closed_surface
@@ -56,8 +57,15 @@ LONGEST_HEADER = 4096
 def write_splats(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Gaussians of the images' pixels, in metres from the scan's origin.
 
-    Raises InputError when there is nothing to make it of, or more ground than SPZ can hold.
+    Raises InputError when there is nothing to make it of, or more ground than SPZ can hold;
+    OutsideError where they are to be trained and there is no CUDA device.
     """
+    if options.train_steps:
+        with needing("--train-steps"):
+            import gsplat  # noqa: F401
+            import torch
+        if not torch.cuda.is_available():
+            raise OutsideError("--train-steps needs a CUDA device; leave it out")
     spz = out.suffix.lower() == ".spz"
     if spz:
         with needing("an SPZ file"):
@@ -99,6 +107,9 @@ def _made(scan: ScanView, options: ExportOptions, box: Box) -> Splats | None:
         surface = partial(closed_surface, scan, LARGEST_FACES)  # another product may make it now
         say = progress.counting(steps(len(keyframes)))
         splats = splats_of(keyframes, views, surface, say, detail)
+    if options.train_steps:
+        say = progress.counting(options.train_steps)
+        splats = trained(splats, views, options.train_steps, say)
     if box != EVERYWHERE:
         splats = splats.at(_inside(scan, splats, box))
     return splats if len(splats) else None

@@ -53,6 +53,7 @@ class ExportOptions:
     to_datum: str | None = None  # what they are converted to
     tile_points: int = TILE_POINTS  # stored points above which products are made in tiles
     scheduler: str | None = None  # of a Dask cluster that makes them
+    train_steps: int = 0  # of Gaussians, on a CUDA device
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes that are not positive, and for an unknown datum."""

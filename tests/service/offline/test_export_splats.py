@@ -6,6 +6,7 @@ import csv
 import shutil
 import subprocess
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -15,7 +16,7 @@ from house_flight import HouseFlight
 from pyproj import Transformer
 
 from recon.surface.splats import Splats
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.georeference import HeightChange
 from service.offline.exports.splats import FIELDS, SH0, origin_words, ply, read_splats
 from service.offline.exports.view import ExportOptions, ScanView, export
@@ -90,6 +91,25 @@ def test_gaussians_without_an_attitude_are_refused(tmp_path: Path, q: float) -> 
 def test_an_ending_that_is_not_of_gaussians_is_refused(flown: Path, tmp_path: Path) -> None:
     with ScanView(flown) as scan, pytest.raises(InputError, match=r"\.ply or \.spz"):
         export(scan, "splat", tmp_path / "x.laz", ExportOptions(stored=True))
+
+
+@pytest.mark.slow
+def test_training_is_refused_before_the_work_where_it_cannot_run(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch = pytest.importorskip("torch", exc_type=ImportError)
+    options = ExportOptions(stored=True, train_steps=5)
+    out = tmp_path / "x.ply"
+    with ScanView(flown) as scan:
+        if find_spec("gsplat") is None:
+            with pytest.raises(OutsideError, match=r"gsplat; pip install 'skyrelief\[splat\]'"):
+                export(scan, "splat", out, options)
+            (tmp_path / "gsplat.py").touch()
+            monkeypatch.syspath_prepend(tmp_path)
+        if not torch.cuda.is_available():
+            with pytest.raises(OutsideError, match="CUDA device"):
+                export(scan, "splat", out, options)
+    assert not out.exists()
 
 
 def test_tiles_join_without_a_seam(flown: Path, tmp_path: Path) -> None:
