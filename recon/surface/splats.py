@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial, reduce
+from functools import cache, partial, reduce
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ from recon.mapping.voxel_map import find_slot, rehash, voxel_key
 from recon.parallel import run_parallel, threads
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView, rays_onto
+from recon.surface.texturing import between_seen
 from recon.types import F32, F64, I32, I64, U8, Array, Bool, DepthMap, Keyframe, PointCloud
 
 WIDTH = 0.5
@@ -48,6 +49,10 @@ MIN_COSINE = 0.2
 
 MERGED = 1.0
 """Of several Gaussians in a cell of so many footprints the one with the least sigma stays."""
+
+BARE_PX, BEHIND, THIN = 3.0, 3, 0.2
+"""Where the closed surface has no Gaussian in a cell of so many footprints, nor in so many in front
+and behind, where noise has put it, it gets one, of so much of its width across the surface."""
 
 MAX_OPACITY, SINGLE = 0.95, 0.85
 """Opacity of what many views, and of what one view or none has measured."""
@@ -120,8 +125,9 @@ def splats_of(
     found = run_parallel(*(partial(measured, k, v) for k, v in zip(keyframes, views, strict=True)))
     kept = _merged(found, [k.depth for k in keyframes])
     made = (partial(_gaussians, *one) for one in zip(found, kept, views, strict=True))
-    splats = joined(run_parallel(*made))
+    splats, surface = joined(run_parallel(*made)), cache(surface)
     splats = joined([splats, *_fillings(splats, views, surface, progress)])
+    splats = joined([splats, _on_bare(splats, surface(), _footprint_m(found))])
     return _fitted(splats, views, progress)
 
 
@@ -318,12 +324,12 @@ def _merged(found: Sequence[_Pixels], depths: Sequence[DepthMap]) -> list[I64]:
     """The pixels of each view that stay: without what other views see through, and of squares of
     one size one where several images show a place."""
     first = np.cumsum([0, *(len(one.sigma_m) for one in found)])
-    places_m, sigma_m, side_px, footprint_m, opacity = (
+    places_m, sigma_m, side_px, opacity = (
         np.concatenate([getattr(one, name) for one in found])
-        for name in ("places_m", "sigma_m", "side_px", "footprint_m", "opacity")
+        for name in ("places_m", "sigma_m", "side_px", "opacity")
     )
     seen = np.where(opacity > SINGLE + 1e-3, 2, 1).astype(np.uint8)
-    cell_m = MERGED * float(np.median(footprint_m)) if len(seen) else 1.0
+    cell_m = MERGED * _footprint_m(found)
     cell, cells, kept = np.empty(len(seen), np.int32), 0, [first[:0]]
     for side in np.unique(side_px):
         some = np.flatnonzero(side_px == side)
@@ -345,6 +351,12 @@ def _merged(found: Sequence[_Pixels], depths: Sequence[DepthMap]) -> list[I64]:
         stay = stay[~is_lone]
     at = np.searchsorted(stay, first)
     return [stay[a:b] - n for a, b, n in zip(at[:-1], at[1:], first[:-1], strict=True)]
+
+
+def _footprint_m(found: Sequence[_Pixels]) -> float:
+    """The middle one of a pixel; 1 without any."""
+    all_m = np.concatenate([one.footprint_m for one in found])
+    return float(np.median(all_m)) if len(all_m) else 1.0
 
 
 @njit(cache=True, nogil=True)
@@ -421,6 +433,111 @@ def _fillings(
         sigma_m = (depth_m / np.float32(view.K[0, 0])).astype(np.float32)
         depth = DepthMap(depth_m, sigma_m, np.zeros(hole.shape, np.uint8), view.K, T)
         out.append(of_depth(depth, hole, view))
+    return out
+
+
+def _on_bare(splats: Splats, mesh: Mesh, footprint_m: float) -> Splats:
+    """Gaussians of the ``mesh`` where it has none next to it: on walls that the views see too flat,
+    or not at all. Their colours run evenly between those around them; without colours of the mesh
+    there are none."""
+    if mesh.rgb is None or not len(splats):
+        return splats.at(np.zeros(0, np.int64))
+    step_m = BARE_PX * footprint_m
+    number, keys = _cells(np.concatenate([splats.xyz_m, *_ends(splats, step_m)]), step_m)
+    corners = mesh.vertices_m[mesh.faces]
+    a, b, c = np.moveaxis(corners, 1, 0)
+    up = np.cross(b - a, c - a)
+    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
+    face, weights = _lattice(mesh.vertices_m, mesh.faces, step_m)
+    places = np.einsum("nk,nkd->nd", weights, corners[face]).astype(np.float32)
+    cell = _cell_along(places, up[face].astype(np.float32), keys, step_m)
+    # A vertex has the colours of the Gaussians around it, in the cells that they lie in.
+    number, met = number[: len(splats)], np.flatnonzero(cell >= 0)
+    corner, share = mesh.faces[face[met]].ravel(), weights[met].ravel()
+    count = np.bincount(number, minlength=len(keys))
+    share *= np.repeat(count[cell[met]] > 0, 3)
+    total = np.bincount(corner, share, len(mesh.vertices_m))
+    is_seen, colour = total > 0, mesh.rgb.astype(np.float64)
+    for k in range(3):
+        mean = np.bincount(number, splats.rgb[:, k], len(keys)) / np.maximum(count, 1)
+        sums = np.bincount(corner, share * np.repeat(mean[cell[met]], 3), len(total))
+        colour[is_seen, k] = sums[is_seen] / total[is_seen]
+    bare = np.flatnonzero(cell < 0)
+    face, weights = face[bare], weights[bare]
+    rgb = between_seen(mesh.faces, colour, is_seen)[mesh.faces[face]].astype(np.float32)
+    along = (b - a)[face]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    q = se3.each_quaternion(np.stack([along, np.cross(up[face], along), up[face]], axis=2))
+    sizes = np.full((len(bare), 3), WIDTH * step_m) * [1.0, 1.0, THIN]
+    return Splats(
+        places[bare], q.astype(np.float32), sizes.astype(np.float32),
+        np.full(len(bare), SINGLE, np.float32), np.einsum("nk,nkd->nd", weights, rgb),
+    )  # fmt: skip
+
+
+def _ends(splats: Splats, cell_m: float) -> list[F32]:
+    """Places (N, 3) one sigma from the middles of Gaussians that are wider than such a cell."""
+    large = splats.at(2.0 * splats.sigma_m[:, :2].max(axis=1) > cell_m)
+    out = []
+    for axis in (0, 1):
+        across = np.zeros_like(large.sigma_m)
+        across[:, axis] = large.sigma_m[:, axis]
+        offset = _turned(large.q_wxyz, across)
+        out += [large.xyz_m + offset, large.xyz_m - offset]
+    return out
+
+
+def _turned(q_wxyz: F32, v: F32) -> F32:
+    """Vectors (N, 3) turned by unit quaternions (N, 4)."""
+    twice = 2.0 * np.cross(q_wxyz[:, 1:], v)
+    return np.asarray(v + q_wxyz[:, :1] * twice + np.cross(q_wxyz[:, 1:], twice), np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _lattice(vertices: F64, faces: I32, step_m: float) -> tuple[I64, F32]:
+    """Places on triangles at most ``step_m`` apart: the triangle (N,) of each and its corners'
+    weights (N, 3)."""
+    sides = np.empty(len(faces), np.int64)
+    for f in range(len(faces)):
+        longest = 0.0
+        for k in range(3):
+            one, other = vertices[faces[f, k]], vertices[faces[f, (k + 1) % 3]]
+            longest = max(longest, np.sqrt(np.sum((one - other) ** 2)))
+        sides[f] = int(np.ceil(max(longest / step_m, 1.0)))
+    total = np.sum(sides * (sides + 1) // 2)
+    face, weights, at = np.empty(total, np.int64), np.empty((total, 3), np.float32), 0
+    for f in range(len(faces)):
+        for i in range(sides[f]):
+            for j in range(sides[f] - i):
+                face[at] = f
+                weights[at, 0] = (i + 1.0 / 3.0) / sides[f]
+                weights[at, 1] = (j + 1.0 / 3.0) / sides[f]
+                weights[at, 2] = 1.0 - weights[at, 0] - weights[at, 1]
+                at += 1
+    return face, weights
+
+
+@njit(cache=True, nogil=True)
+def _cell_along(places: F32, up: F32, cells: I64, cell_m: float) -> I32:
+    """(N,) which of the ``cells`` (C,), by keys, each place lies in, or what is up to BEHIND cells
+    from it across the surface (N, 3); -1: none."""
+    size = 16
+    while size < 2 * len(cells):
+        size *= 2
+    keys, ids = np.full(size, -1, np.int64), np.zeros(size, np.int32)
+    for n in range(len(cells)):
+        slot = find_slot(keys, cells[n])
+        keys[slot], ids[slot] = cells[n], n
+    out = np.full(len(places), -1, np.int32)
+    for n in range(len(places)):
+        for m in range(4 * BEHIND + 1):
+            off = 0.5 * cell_m * ((m + 1) // 2 if m % 2 else -(m // 2))
+            x, y = places[n, 0] + off * up[n, 0], places[n, 1] + off * up[n, 1]
+            key = voxel_key(x, y, places[n, 2] + off * up[n, 2], 1.0 / cell_m)
+            slot = find_slot(keys, key)
+            if keys[slot] != -1:
+                out[n] = ids[slot]
+                break
     return out
 
 

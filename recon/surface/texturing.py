@@ -26,7 +26,7 @@ from recon.surface.texture_views import (
     look,
     projected,
 )
-from recon.types import F32, F64, I32, U8
+from recon.types import F32, F64, I32, U8, Bool
 
 LARGEST_ATLAS_PX = 8192
 
@@ -111,13 +111,8 @@ Laplacian)."""
 
 
 def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32) -> U8:
-    """(V, 3) colours for triangles without a view: those of the seen ones around them, far from
-    these the vertices' own ``rgb``.
-
-    Between seen ones they are harmonic, each the mean of those around it, so details of what is
-    seen leave no streaks in what is not. A vertex's own colour is that of the upper surface above
-    or below it: a roof's, on a wall.
-    """
+    """(V, 3) colours for triangles without a view: those of the seen ones around them, as
+    :func:`between_seen`."""
     rows = np.flatnonzero(slot >= 0)
     shown = found.bgr[rows, slot[rows], ::-1]
     colour = rgb.astype(np.float64)
@@ -127,8 +122,20 @@ def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32) -> U8:
     for k in range(3):
         total = np.bincount(corner, np.repeat(shown[:, k], 3), len(rgb))
         colour[is_seen, k] = total[is_seen] / count[is_seen]
+    return between_seen(faces, colour, is_seen)
+
+
+def between_seen(faces: I32, colour: F64, is_seen: Bool) -> U8:
+    """(V, 3) colours of vertices, where they are not seen (V,) by those that are, and far from
+    these by their own.
+
+    Between seen ones they are harmonic, each the mean of those around it, so details of what is
+    seen leave no streaks in what is not. A vertex's own colour is that of the upper surface above
+    or below it: a roof's, on a wall.
+    """
+    colour = colour.copy()
     ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    one_way = sparse.csr_matrix((np.ones(faces.size), ends), (len(rgb), len(rgb)))
+    one_way = sparse.csr_matrix((np.ones(faces.size), ends), (len(colour),) * 2)
     rest = np.flatnonzero(~is_seen)
     around = (one_way + one_way.T)[rest]
     A = sparse.diags(np.asarray(around.sum(axis=1)).ravel() + OWN_WEIGHT) - around[:, rest]

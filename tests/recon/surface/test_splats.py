@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -22,7 +24,7 @@ from recon.surface.splats import (
     splats_of,
 )
 from recon.surface.texture_views import TextureView
-from recon.types import F64, DepthMap, Keyframe, Pose
+from recon.types import F64, U8, DepthMap, Keyframe, Pose
 
 pytestmark = pytest.mark.slow  # compiles
 
@@ -194,6 +196,36 @@ def test_a_view_from_elsewhere_shows_the_surface() -> None:
     assert (opacity[inner] >= COVERED).all()
     error = np.sqrt(np.mean((image[inner] - true[inner]) ** 2))
     assert 20.0 * np.log10(255.0 / error) > 30.0
+
+
+def test_a_wall_that_no_image_shows_is_closed_in_colours_that_run_on() -> None:
+    """Ground below a camera that looks straight down, and north of its image a wall of eight
+    metres."""
+    depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
+    along, x = np.meshgrid(np.arange(-6.0, 17.5, 0.5), np.arange(-8.0, 8.5, 0.5), indexing="ij")
+    sheet = np.stack([x, np.minimum(along, 9.0), np.maximum(along - 9.0, 0.0)], axis=2)
+    rows, cols = (n.ravel() for n in np.mgrid[: len(along) - 1, : along.shape[1] - 1])
+    a = rows * along.shape[1] + cols
+    b, c, d = a + 1, a + along.shape[1] + 1, a + along.shape[1]
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    roof: U8 = np.full((along.size, 3), 250, np.uint8)
+    bare = Mesh(sheet.reshape(-1, 3), faces.astype(np.int32))
+    view, one = painted(depth), keyframe(0, depth)
+    view.bgra[..., :3] = 60
+    without = splats_of([one], [view], lambda: bare)
+    splats = splats_of([one], [view], lambda: replace(bare, rgb=roof))
+    added = splats.at(np.arange(len(without), len(splats)))
+    assert added.xyz_m[:, 1].min() > 6.5 and added.xyz_m[:, 2].max() > 7.0
+    added = added.at(added.xyz_m[:, 2] > 1e-3)
+    R = Rotation.from_quat(added.q_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+    assert np.allclose(R[:, :, 2], [0.0, -1.0, 0.0], atol=1e-3)
+    low, high = added.xyz_m[:, 2] < 2.0, added.xyz_m[:, 2] > 7.0
+    assert added.rgb[low].min() > 55.0 and added.rgb[low].max() < 80.0 < added.rgb[high].min()
+    north = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    looks = se3.compose(north, np.array([0.0, -11.0, 4.0]))
+    half = np.s_[SIZE[1] // 2 - 7 : SIZE[1] // 2 + 7, SIZE[0] // 2 - 18 : SIZE[0] // 2 + 18]
+    shown, before = (rendered(s, K, SIZE, looks)[1][half] for s in (splats, without))
+    assert (shown >= COVERED).all() and (before < COVERED).mean() > 0.8
 
 
 def test_flat_areas_have_few_gaussians_and_edges_all() -> None:
