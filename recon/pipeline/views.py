@@ -225,7 +225,7 @@ class ViewSelection:
         others.sort(key=lambda v: _apart(v, view))
         if self._all_known:
             # Of all baselines that stereo can bridge; the nearest where there are none.
-            widest = WIDEST * median_depth(view.keyframe)
+            widest = WIDEST * median_depth(view.reference_keyframe)
             good = [v for v in others if _apart(v, view) <= widest]
             return _evenly(good, KNOWN_PARTNERS * self.max_partners) or others[: self.max_partners]
         if not self._between:
@@ -341,18 +341,18 @@ class VirtualStereoCamera:
     def _stereo_view(self, view: Frame, partners: list[Frame]) -> StereoView:
         """The view with its image, which is without distortion from now on."""
         assert view.T_keyframe_camera is not None
-        points = landmark_points(view.keyframe)
+        points = landmark_points(view.reference_keyframe)
         points = se3.transform(se3.inverse(view.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         # Of the motion since the view given before.
-        since = self._given[-1].keyframe.seq if self._given else -1
-        keys = [k for k in self._odometry.keyframes if since < k.seq <= view.keyframe.seq]
+        since = self._given[-1].reference_keyframe.seq if self._given else -1
+        keys = [k for k in self._odometry.keyframes if since < k.seq <= view.reference_keyframe.seq]
         return StereoView(
             view.without_images(),
             replace(self._posed(view, in_odom), bgr=self._undistorter.image(view.image)),
             tuple(self._posed(partner, in_odom) for partner in partners),
             points,
-            step_covariance(keys or [view.keyframe], se3.inverse(view.T_odom_camera)),
+            step_covariance(keys or [view.reference_keyframe], se3.inverse(view.T_odom_camera)),
             {a.seq: a.T_odom_camera for a in self._given if a.segment == view.segment},
             self._rows_share(view, partners, points),
         )

@@ -119,7 +119,8 @@ class Frame:
         return self.T_keyframe_camera is not None
 
     @property
-    def keyframe(self) -> Frame:
+    def reference_keyframe(self) -> Frame:
+        """The keyframe of the odometry, a frame too, that this frame's pose is relative to."""
         assert self.reference is not None, "a frame of stereo is tracked, and not settled"
         return self.reference
 

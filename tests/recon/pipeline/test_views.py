@@ -75,7 +75,7 @@ def test_colour_is_undistorted_when_its_view_is_given_and_not_kept() -> None:
     held = []
     for i in range(3):
         plain = frame(i, 5.0 * i)
-        keys.append(plain.keyframe)
+        keys.append(plain.reference_keyframe)
         image = np.random.default_rng(i).integers(0, 255, (32, 32, 3), np.uint8)
         held.append((weakref.ref(image), Undistorter(lens).image(image)))
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
@@ -212,7 +212,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
     views = stereo_camera(keys, Mock(ReadoutSearch, doubt_s=doubt_s))
     for i in range(3):
         plain = frame(i, 5.0 * i)
-        keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
+        keys.append(replace(plain.reference_keyframe, uv=corners, landmark=ids, landmarks=ground))
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         row_motion = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
@@ -238,7 +238,7 @@ def test_views_wait_for_the_first_word_on_their_readout(
     given, counts = [], []
     for i in range(6):
         plain = frame(i, 5.0 * i)
-        keys.append(plain.keyframe)
+        keys.append(plain.reference_keyframe)
         row_motion = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(replace(plain, state=state, row_motion=row_motion))
@@ -255,7 +255,7 @@ def test_a_view_that_waited_while_the_next_segment_grew_is_confirmed_by_its_own(
     given = []
     for i in range(8):
         plain = frame(i, 5.0 * i, segment=i // 4)
-        keys.append(plain.keyframe)
+        keys.append(plain.reference_keyframe)
         row_motion = FrameRows(i, PosePrior(), np.eye(4), is_measured=True)
         state = Tracking.KEYFRAME if i % 4 else Tracking.STARTED
         views.take(replace(plain, state=state, row_motion=row_motion))
@@ -269,7 +269,7 @@ def test_a_view_knows_the_earlier_ones_of_its_segment_alone() -> None:
     views, earlier = stereo_camera(keys), dict[int, set[int]]()
     for i in range(8):
         plain = frame(i, 5.0 * i, segment=i // 4)
-        keys.append(plain.keyframe)
+        keys.append(plain.reference_keyframe)
         views.take(replace(plain, state=Tracking.KEYFRAME if i % 4 else Tracking.STARTED))
         earlier |= {view.seq: set(view.earlier) for view in views.ready()}
     assert {5, 6} <= earlier.keys() and earlier[6] >= {5}
@@ -282,7 +282,7 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
     views = stereo_camera(keys, shown_s=exposure_s)
     for i in range(4):
         plain = frame(i, float(i))
-        keys.append(plain.keyframe)
+        keys.append(plain.reference_keyframe)
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         image_rad_s = np.array([-0.2, 0.1]) if i else None
         views.take(replace(plain, state=state, image_rad_s=image_rad_s, pyramid=(plain.gray,)))
@@ -306,7 +306,7 @@ def test_a_view_is_given_once_with_the_first_frame_that_shows_its_depth() -> Non
         plain = frame(seq, x_m, blurred=blurred)
         is_key = seq % 10 == 0
         if is_key:
-            keys.append(plain.keyframe)
+            keys.append(plain.reference_keyframe)
         state = Tracking.TRACKED if not is_key else Tracking.KEYFRAME if seq else Tracking.STARTED
         views.take(replace(plain, state=state))
 
