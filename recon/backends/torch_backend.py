@@ -14,7 +14,7 @@ from recon.backends.torch_depth import DensePath, upsampled
 from recon.backends.torch_plan import Plan, compiling, part, read
 from recon.backends.triton_dense import contrast, stereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
-from recon.stereo.exposure import equalised
+from recon.stereo.brightness_transfer import match_brightness
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import check_guide
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
@@ -51,7 +51,7 @@ class TorchBackend:
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
         check_pair(left, right, labels)
-        right = equalised(left, right, labels, config.min_disparity)
+        right = match_brightness(left, right, labels, config.min_disparity)
         h, w = left.shape
         *space, label_count = padded(h, w, labels)
         levels = pyramid_levels(h, w, config)

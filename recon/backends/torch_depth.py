@@ -28,7 +28,7 @@ from recon.backends.triton_dense import (
     stereo,
 )
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.exposure import equalised
+from recon.stereo.brightness_transfer import match_brightness
 from recon.stereo.reprojection import (
     LABEL_SIGMA_PX,
     MAX_NOISE,
@@ -160,7 +160,7 @@ def device_inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:
     base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX * pair.noise]
     geometry = np.concatenate([to_left.ravel(), pair.plane, base]).astype(np.float64)
     true = np.array([h, w, guide.shape[0], guide.shape[1], pair.labels], np.int64)
-    right = equalised(pair.left, pair.right, pair.labels, min_disparity)
+    right = match_brightness(pair.left, pair.right, pair.labels, min_disparity)
     return [pair.left, right, *seen, guide, true, geometry]
 
 

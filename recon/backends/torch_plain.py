@@ -21,7 +21,7 @@ from recon.stereo.belief_propagation import (
     BeliefPropagationConfig,
     drop_unreliable,
 )
-from recon.stereo.exposure import equalised
+from recon.stereo.brightness_transfer import match_brightness
 from recon.stereo.matching_cost import check_pair
 from recon.types import F32, U8, DisparityMap
 
@@ -44,7 +44,7 @@ class PlainTorchBackend(CpuBackend):
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
         check_pair(left, right, labels)
-        right = equalised(left, right, labels, config.min_disparity)
+        right = match_brightness(left, right, labels, config.min_disparity)
         with torch.inference_mode():
             a, b = (torch.from_numpy(np.ascontiguousarray(i)).float() for i in (left, right))
             cost = matching_cost(a, b, labels, config)

@@ -20,7 +20,7 @@ from recon.backends.cpu import CpuBackend
 from recon.calibration.adjusted_track import AdjustedTrack
 from recon.calibration.focal_watch import FocalWatch
 from recon.mapping.cloud_fusion import cloud_of, fuse
-from recon.mapping.exposure_compensation import ExposureCompensation
+from recon.mapping.gain_compensation import GainCompensation
 from recon.mapping.voxel_map import VoxelMap, ground_sample_m
 from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import KeyframeMap, SurfaceMap
@@ -200,7 +200,7 @@ class Mapper:
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframe_map = KeyframeMap(trajectory, loops, backend, self.rejected, timing)
         self.surface = SurfaceMap(trajectory.similarities, config.resolution_m, new_map)
-        self.exposure = ExposureCompensation()
+        self.gains = GainCompensation()
         self.frame_poses = FramePoses(self.keyframe_map, self.is_settled)
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
         self._ready = set[int]()  # numbers of all keyframes that are given out
@@ -313,7 +313,7 @@ class Mapper:
         with self._timing("map"):  # what is new
             T_odom = self.keyframe_map.trajectory.odom_pose(view.seq)
             depth, fresh = self.surface(view.seq, view.segment, depth, view.rows_share, T_odom)
-            bgr = self.exposure(view.segment, depth, bgr)  # as bright as the map
+            bgr = self.gains(view.segment, depth, bgr)  # as bright as the map
         keyframe = keyframe_of(view, depth, bgr, fresh, pose)
         if self.debug is not None:
             metric = keyframe.depth
@@ -343,7 +343,7 @@ class Mapper:
             return None, ()
         T_odom, pose = predicted
         depth, fresh = self.surface.peek(depth, view.rows_share, T_odom)
-        first = keyframe_of(view, depth, self.exposure.level(bgr), fresh, pose)
+        first = keyframe_of(view, depth, self.gains.level(bgr), fresh, pose)
         return None, (KeyframeReady(first, is_first_depth=True),)
 
     def drain(self) -> tuple[Event, ...]:

@@ -25,7 +25,7 @@ from numba.extending import intrinsic
 
 from recon.image_quality import local_variance
 from recon.parallel import parallel_for
-from recon.stereo.exposure import equalised
+from recon.stereo.brightness_transfer import match_brightness
 from recon.stereo.lanes import LANES, PARTS, Lanes
 from recon.stereo.matching_cost import COST_UNIT, check_pair, matching_cost, plain
 from recon.stereo.message_passing import (
@@ -86,7 +86,7 @@ def belief_propagation(
     ``l`` matches ``right[v, u - l - config.min_disparity]``. Raises ValueError for bad input.
     """
     check_pair(left, right, labels)
-    right = equalised(left, right, labels, config.min_disparity)
+    right = match_brightness(left, right, labels, config.min_disparity)
     most = min(4 * config.truncation, 255)
     above, least = matching_cost(left, right, labels, config.min_disparity, most)
     weights = pyramid_of(config.smoothness.weights(plain(left)), config.levels)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
-from recon.stereo.exposure import equalised
+from recon.stereo.brightness_transfer import match_brightness
 from recon.types import U8
 from service.bench.stereo import scene
 
@@ -42,7 +42,9 @@ def test_labels_are_the_compiled_ones(
     def image(gray: U8) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         return gray.astype(np.float32)[None, None]
 
-    right = equalised(left, right, labels, config.min_disparity)  # the model does not do that
+    right = match_brightness(
+        left, right, labels, config.min_disparity
+    )  # the model does not do that
     (found,) = session.run(None, {"left": image(left), "right": image(right)})
     got = found[0, 0] - config.min_disparity
     known = np.isfinite(want)

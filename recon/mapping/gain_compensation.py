@@ -1,4 +1,4 @@
-"""One exposure for all images of a flight, whatever automatic exposure and clouds do.
+"""One brightness for all images of a flight, whatever automatic exposure and clouds do.
 
 A colour times a gain is the same colour at another exposure. Most of what an image shows earlier
 ones showed, too; a gain for each channel makes them agree. It is the same all over the image: one
@@ -42,7 +42,7 @@ KNEE = np.float32(224)  # levels that a gain lifts beyond this one approach whit
 MAX_LOG = float(np.log(3.0))
 
 
-class ExposureCompensation:
+class GainCompensation:
     """Levels each new image with the last ones."""
 
     def __init__(self) -> None:

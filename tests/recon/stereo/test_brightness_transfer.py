@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.stereo.exposure import equalised
+from recon.stereo.brightness_transfer import match_brightness
 from recon.types import F64, U8, Array
 
 LABELS = 16
@@ -53,17 +53,17 @@ def test_one_surface_gets_one_gray_level(exposure: object, first: int) -> None:
     changed = levels(exposure(right))  # type: ignore[operator]
     alike = apart(left, right, partner)
     assert apart(left, changed, partner) > alike + 6
-    assert apart(left, equalised(left, changed, LABELS, first), partner) < alike + 1.2
+    assert apart(left, match_brightness(left, changed, LABELS, first), partner) < alike + 1.2
 
 
 def test_equal_exposures_are_left_as_they_are() -> None:
     left, right, _ = pair()
-    assert np.abs(equalised(left, right, LABELS).astype(int) - right).max() <= 2
-    np.testing.assert_array_equal(equalised(left, left, LABELS), left)
+    assert np.abs(match_brightness(left, right, LABELS).astype(int) - right).max() <= 2
+    np.testing.assert_array_equal(match_brightness(left, left, LABELS), left)
 
 
 def test_without_clear_matches_nothing_changes() -> None:
     left, right = np.random.default_rng(0).integers(0, 256, (2, 120, 200), np.uint8)
     blank = np.full((120, 200), 90, np.uint8)
     for a, b in ((blank, blank), (left, blank), (left[:7, :9], right[:7, :9])):
-        assert equalised(a, b, LABELS) is b
+        assert match_brightness(a, b, LABELS) is b

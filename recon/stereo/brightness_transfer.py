@@ -1,4 +1,4 @@
-"""The right image with the gray levels of the left one, wherever their exposures differ.
+"""The right image with the gray levels of the left one: their brightness transfer function.
 
 Auto exposure, tone curves and vignetting give one surface two gray levels. The matching cost
 compares them, so the right image is corrected first: clear matches by census, which needs no equal
@@ -31,7 +31,7 @@ STEPS = 4
 MIN_SAMPLES, FITTED = 64, 500  # clear matches that are needed, and at most used
 
 
-def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
+def match_brightness(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
     """``right`` (h, w) with the gray levels that its surfaces have in ``left``.
 
     The labels are those of :func:`recon.stereo.matching_cost.matching_cost`. Returns ``right``
