@@ -33,7 +33,7 @@ MOTION_SHARE = 1.5
 """A median streak beyond so many times the motion from image to image is none of motion, as no
 shutter is open for longer: strong compression or noise reduction smears, too."""
 
-KEPT, MIN_KNOWN = 15, 5  # keyframes that the exposure follows from, at most and at least
+KEPT, MIN_KNOWN = 15, 5  # keyframes that the exposure time is of, at most and at least
 
 
 def streak_px(gray: U8, direction: F64) -> float:
@@ -62,8 +62,8 @@ def _first_zero(gray: U8, direction: F64) -> float:
     return float(k - alike[k] / (alike[k] - alike[k - 1]))
 
 
-class ExposureWatch:
-    """Finds the exposure by the streaks of keyframes and how fast their images moved."""
+class ExposureTimeWatch:
+    """Finds the exposure time by the streaks of keyframes and how fast their images moved."""
 
     def __init__(self) -> None:
         self._streaks: deque[tuple[float, float]] = deque(maxlen=KEPT)  # px, px/s
@@ -71,7 +71,7 @@ class ExposureWatch:
         self.exposure_s: float | None = None  # by the images; None while too few show it
         self.shown_s = 0.0  # the exposure where it smears the images; 0: as sharp as others
         self.blur_px = 0.0  # median streak of the last keyframes; 0 where it does no harm
-        # The strongest ``blur_px`` so far, and the exposure in s then; None while images are sharp.
+        # The strongest ``blur_px`` so far, and ``exposure_s`` then; None while images are sharp.
         self.strongest: tuple[float, float] | None = None
         self.is_of_motion = True  # the strongest
 

@@ -15,7 +15,7 @@ import numpy as np
 from recon import se3
 from recon.calibration.adjusted_track import AnyTrack
 from recon.camera_model import Undistorter
-from recon.motion_blur import ExposureWatch
+from recon.motion_blur import ExposureTimeWatch
 from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import depth_share
 from recon.row_errors import turn_shares
@@ -266,7 +266,7 @@ class VirtualStereoCamera:
         self._given: deque[Frame] = deque(maxlen=8)
         self._first = -1  # number of the newest view that was given with its first partner
         self._latest: Frame | None = None  # the last tracked frame, unless it is a view
-        self.exposure = ExposureWatch()
+        self.exposure_time = ExposureTimeWatch()
         self._frame_ns = self._image_ns = 0  # of the last frame, and of the last image
 
     def pass_over(self, time_ns: int) -> None:
@@ -275,7 +275,7 @@ class VirtualStereoCamera:
 
     def take(self, tracked: Frame) -> bool:
         """Whether the next frame becomes a view."""
-        self._watch_exposure(tracked)
+        self._watch_exposure_time(tracked)
         if tracked.segment != self._segment:
             self.end_segment()
             self._segment = tracked.segment
@@ -289,14 +289,14 @@ class VirtualStereoCamera:
         self._latest = None if is_view else frame
         return is_view
 
-    def _watch_exposure(self, tracked: Frame) -> None:
+    def _watch_exposure_time(self, tracked: Frame) -> None:
         gap_s, image_gap_s = (
             1e-9 * (tracked.time_ns - before) for before in (self._frame_ns, self._image_ns)
         )
         self._frame_ns = self._image_ns = tracked.time_ns
         if tracked.state is Tracking.KEYFRAME and tracked.image_rad_s is not None:
             px_s = self._odometry.K[0, 0] * tracked.image_rad_s
-            self.exposure.add(tracked.small, px_s, gap_s, image_gap_s)
+            self.exposure_time.add(tracked.small, px_s, gap_s, image_gap_s)
 
     def end_segment(self) -> None:
         """Make a view of a segment's last frame: only it shows what the camera saw last."""
@@ -392,7 +392,7 @@ class VirtualStereoCamera:
     def _blur_px(self, view: Frame) -> F64 | None:
         """(2,) px by which the middle of the image moved during the exposure; None where images are
         sharp or its motion is not known."""
-        exposure_s = self.exposure.shown_s
+        exposure_s = self.exposure_time.shown_s
         if not exposure_s or view.image_rad_s is None:
             return None
         return np.asarray(self._K[0, 0] * exposure_s * view.image_rad_s)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.motion_blur import ExposureWatch
+from recon.motion_blur import ExposureTimeWatch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.sensor_offsets import Constants
 from recon.tracking.frame import Frame, Tracking
@@ -205,14 +205,14 @@ class TrackingWatch:
             self._is_reported = True
 
 
-def motion_blur(exposure: ExposureWatch, px_per_px: float) -> dict[str, Any] | None:
+def motion_blur(exposure_time: ExposureTimeWatch, px_per_px: float) -> dict[str, Any] | None:
     """The strongest blur so far, fit for JSON; None while the images are sharp. Without an
-    exposure where motion cannot have caused it. ``px_per_px``: pixels of the recording to one of
-    the images that are tracked."""
-    if exposure.strongest is None:
+    exposure time where motion cannot have caused it. ``px_per_px``: pixels of the recording to one
+    of the images that are tracked."""
+    if exposure_time.strongest is None:
         return None
-    blur_px, exposure_s = exposure.strongest
-    shown_ms = round(1e3 * exposure_s, 1) if exposure.is_of_motion else None
+    blur_px, exposure_s = exposure_time.strongest
+    shown_ms = round(1e3 * exposure_s, 1) if exposure_time.is_of_motion else None
     return {"blur_px": round(px_per_px * blur_px, 1), "exposure_ms": shown_ms}
 
 

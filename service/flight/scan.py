@@ -212,7 +212,7 @@ class Scan:
     def motion_blur(self) -> dict[str, Any] | None:
         """The strongest blur so far, fit for JSON; None while the images are sharp."""
         finer = float(self.inputs.camera.K[0, 0] / self.mapper.odometry.K[0, 0])
-        return motion_blur(self.mapper.views.exposure, finer)
+        return motion_blur(self.mapper.views.exposure_time, finer)
 
     def report_blur(self) -> None:
         """Report to the operator once that the images are blurred, and by what."""

@@ -14,7 +14,7 @@ from tracked_frame import undistorted
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.motion_blur import ExposureWatch, streak_px
+from recon.motion_blur import ExposureTimeWatch, streak_px
 from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
@@ -67,8 +67,8 @@ def test_an_image_without_texture_has_no_streak() -> None:
 
 def watch_of(
     image: U8, exposure_s: float, speeds: list[float], image_gap_s: float = 1.0 / FPS
-) -> ExposureWatch:
-    watch = ExposureWatch()
+) -> ExposureTimeWatch:
+    watch = ExposureTimeWatch()
     for speed in speeds:
         shot = blurred(image, speed * exposure_s, 20.0) if exposure_s else image
         d = np.radians(20.0)
@@ -123,7 +123,7 @@ def test_a_shutter_too_slow_for_the_speed_is_seen_in_the_images() -> None:
     ground, exposure_s = painted_ground(), 0.05
     odometry = Odometry(CAMERA)
     views = VirtualStereoCamera(ViewSelection(), odometry, Undistorter(CAMERA), Counter())
-    assert motion_blur(views.exposure, 2.0) is None
+    assert motion_blur(views.exposure_time, 2.0) is None
     for i in range(int(5 * FPS)):
         t = i / FPS
         moments = t + exposure_s * np.linspace(-0.5, 0.5, 7)
@@ -133,7 +133,7 @@ def test_a_shutter_too_slow_for_the_speed_is_seen_in_the_images() -> None:
         prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 2.0)
         for tracked in odometry.track(undistorted(gray, i, round(1e9 * t), prior)):
             views.take(tracked)
-    blur = motion_blur(views.exposure, 2.0)
+    blur = motion_blur(views.exposure_time, 2.0)
     assert blur is not None and blur["exposure_ms"] == pytest.approx(50.0, rel=0.3)
     assert blur["blur_px"] > 10.0, "px of the recording, twice as fine"
     assert f"images by {blur['blur_px']:.0f} px" in blur_note(blur)

@@ -14,7 +14,7 @@ from some_views import keyframe_at
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.motion_blur import ExposureWatch
+from recon.motion_blur import ExposureTimeWatch
 from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.frame import Frame, Landmarks, Tracking
@@ -56,7 +56,7 @@ def stereo_camera(
         ViewSelection(), cast(Odometry, KnownTrack(keys, readout)),
         undistorter or Undistorter(Camera(K, np.zeros(5), size)), Counter(),
     )  # fmt: skip
-    views.exposure = Mock(ExposureWatch, shown_s=shown_s)
+    views.exposure_time = Mock(ExposureTimeWatch, shown_s=shown_s)
     return views
 
 
