@@ -64,9 +64,9 @@ class ReceiverConfig:
     name: str = ""  # of this station; empty: made once and kept in the store
 
 
-class Drone:
-    """A drone's scans, which its worker alone changes, and what waits for them: put in from any
-    thread, and bounded so that no drone takes another's memory."""
+class DroneMailbox:
+    """What waits for a drone's worker: put in from any thread, and bounded so that no drone takes
+    another's memory. And the scans of that drone, which the worker alone changes."""
 
     worker: Worker
 
@@ -138,10 +138,10 @@ class Receiver:
         self.limits, self.workers = config.limits, workers or Workers()
         self._session: zenoh.Session | None = None
         self._session_config = config.session
-        self._lock = threading.RLock()  # of the table of drones, and of the radio
-        self._drones: dict[str, Drone] = {}  # the last begun last
+        self._lock = threading.RLock()  # of the table of mailboxes, and of the radio
+        self._mailboxes: dict[str, DroneMailbox] = {}  # the last begun last
         self._tunnel = TunnelIntake()
-        self._writes: queue.Queue[tuple[drone.Write, Drone] | None] = queue.Queue()
+        self._writes: queue.Queue[tuple[drone.Write, DroneMailbox] | None] = queue.Queue()
         self._left: list[Path] = []  # folders whose files a former process did not write
         self._running: list[Worker] = []
         self._dropped = 0
@@ -171,11 +171,11 @@ class Receiver:
         """End, and write the deliverables of what has changed."""
         for worker in self._running:
             if worker.row.name == "deliverables":  # when nothing more comes
-                for one in self._all:
-                    one.worker.stop.set()
-                for one in self._all:
-                    one.worker.join()
-                    guarded(f"scans of {one.scans.drone}", partial(self._end, one))
+                for mailbox in self._all:
+                    mailbox.worker.stop.set()
+                for mailbox in self._all:
+                    mailbox.worker.join()
+                    guarded(f"scans of {mailbox.scans.drone}", partial(self._end, mailbox))
                 self._writes.put(None)
             worker.join()
         self._running = []
@@ -184,23 +184,23 @@ class Receiver:
         """Take in a message of the narrow radio; from any thread."""
         with self._lock:
             for item in self._tunnel.receive(payload):
-                one = self._drone(item[0].drone)
-                if one is not None:
-                    one.put(drone.Radio(*item))
+                mailbox = self._mailbox(item[0].drone)
+                if mailbox is not None:
+                    mailbox.put(drone.Radio(*item))
 
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
-        return [entry for one in self._all for entry in one.scans.entries]
+        return [entry for mailbox in self._all for entry in mailbox.scans.entries]
 
     @property
     def dropped(self) -> int:
         """Messages that were malformed, foreign or too many."""
-        return self._dropped + sum(one.dropped + one.scans.dropped for one in self._all)
+        return self._dropped + sum(mailbox.dropped + mailbox.scans.dropped for mailbox in self._all)
 
     @property
     def last_news_at(self) -> float:
         """When something new was stored last, or this began; monotonic seconds."""
-        return max((one.scans.news_at for one in self._all), default=self._began_at)
+        return max((mailbox.scans.news_at for mailbox in self._all), default=self._began_at)
 
     # The session
 
@@ -234,7 +234,7 @@ class Receiver:
             now = time.monotonic()
             if now >= look_at:
                 look_at = now + LOOK_AROUND_S
-                if all(now - one.scans.heard_at > LOOK_AROUND_S for one in self._all):
+                if all(now - mailbox.scans.heard_at > LOOK_AROUND_S for mailbox in self._all):
                     with contextlib.suppress(zenoh.ZError):  # all present drones send their heads
                         session.get(f"{ROOT}/*/*/head", ring, timeout=LOOK_AROUND_S)
 
@@ -264,26 +264,26 @@ class Receiver:
         if place is None:
             with self._lock:
                 self._dropped += 1
-        elif (one := self._drone(place[0])) is not None and key.endswith("/head"):
-            one.put_head(place[1], payload)
-        elif one is not None:
-            one.put(drone.Item(place[1], payload))
+        elif (mailbox := self._mailbox(place[0])) is not None and key.endswith("/head"):
+            mailbox.put_head(place[1], payload)
+        elif mailbox is not None:
+            mailbox.put(drone.Item(place[1], payload))
 
     # The drones
 
     @property
-    def _all(self) -> list[Drone]:
+    def _all(self) -> list[DroneMailbox]:
         with self._lock:
-            return list(self._drones.values())
+            return list(self._mailboxes.values())
 
     @property
-    def _busy(self) -> list[Drone]:
-        return [one for one in self._all if not one.worker.is_done]
+    def _busy(self) -> list[DroneMailbox]:
+        return [mailbox for mailbox in self._all if not mailbox.worker.is_done]
 
-    def _drone(self, name: str) -> Drone | None:
-        """A drone, its worker started if need be; None where one more is too many."""
+    def _mailbox(self, name: str) -> DroneMailbox | None:
+        """A drone's mailbox, its worker started if need be; None where one more is too many."""
         with self._lock:
-            found, now = self._drones.get(name), time.monotonic()
+            found, now = self._mailboxes.get(name), time.monotonic()
             if found is not None and not found.worker.is_done:
                 return found
             if not self._has_room(now):
@@ -293,14 +293,16 @@ class Receiver:
                     log.warning("%s is not received: %d drones are", name, self.limits.drones)
                 return None
             self._sweep(now)
-            one = self._drones.pop(name, None)
-            if one is None:
+            mailbox = self._mailboxes.pop(name, None)
+            if mailbox is None:
                 store = self._config.store
-                one = Drone(drone.DroneReceiver(name, store, self.name, self.limits, now))
-            one.scans.heard_at = now
-            one.worker = self.workers.start(f"drone {name}", partial(self._receive, one))
-            self._drones[name] = one
-            return one
+                mailbox = DroneMailbox(
+                    drone.DroneReceiver(name, store, self.name, self.limits, now)
+                )
+            mailbox.scans.heard_at = now
+            mailbox.worker = self.workers.start(f"drone {name}", partial(self._receive, mailbox))
+            self._mailboxes[name] = mailbox
+            return mailbox
 
     def _has_room(self, now: float) -> bool:
         """Whether one more drone may come. If need be one that never had a scan and is silent makes
@@ -308,75 +310,80 @@ class Receiver:
         busy = self._busy
         if len(busy) < self.limits.drones:
             return True
-        for one in busy:
-            if not one.scans.entries and now - one.scans.heard_at > STRANGER_S:
-                self._forget(one)
+        for mailbox in busy:
+            if not mailbox.scans.entries and now - mailbox.scans.heard_at > STRANGER_S:
+                self._forget(mailbox)
                 return True
-        silent = [one for one in busy if now - one.scans.heard_at > self.limits.silent_s]
+        silent = [
+            mailbox for mailbox in busy if now - mailbox.scans.heard_at > self.limits.silent_s
+        ]
         if silent:
-            min(silent, key=lambda one: (one.brought, one.scans.heard_at)).worker.stop.set()
+            least = min(silent, key=lambda mailbox: (mailbox.brought, mailbox.scans.heard_at))
+            least.worker.stop.set()
         return False
 
     def _sweep(self, now: float) -> None:
         """Forget strangers and faults that have ended, and the oldest of too many others."""
-        ended = [one for one in self._all if one.worker.is_done]
-        known = [one for one in ended if one.scans.entries and not one.worker.has_failed]
-        for one in set(ended) - set(known[-MAX_RESTING:]):
-            self._end(one)
-            self._forget(one)
+        ended = [mailbox for mailbox in self._all if mailbox.worker.is_done]
+        known = [
+            mailbox for mailbox in ended if mailbox.scans.entries and not mailbox.worker.has_failed
+        ]
+        for mailbox in set(ended) - set(known[-MAX_RESTING:]):
+            self._end(mailbox)
+            self._forget(mailbox)
 
-    def _forget(self, one: Drone) -> None:
-        one.worker.stop.set()
-        self._dropped += one.dropped + one.scans.dropped
-        del self._drones[one.scans.drone]
+    def _forget(self, mailbox: DroneMailbox) -> None:
+        mailbox.worker.stop.set()
+        self._dropped += mailbox.dropped + mailbox.scans.dropped
+        del self._mailboxes[mailbox.scans.drone]
 
-    def _receive(self, one: Drone, worker: Worker) -> None:
+    def _receive(self, mailbox: DroneMailbox, worker: Worker) -> None:
         """Take in what arrives from one drone, until the stop or until nothing more comes."""
-        scans, now = one.scans, time.monotonic()
+        scans, now = mailbox.scans, time.monotonic()
         while not (worker.stop.is_set() or scans.is_idle(now)):
             worker.beat()
-            came = one.take(TICK_S)
+            came = mailbox.take(TICK_S)
             began_s, now = time.thread_time(), time.monotonic()
             descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
             room = descriptors // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN
             room //= max(1, len(self._busy))
             scans.max_open = max(2, min(self.limits.open_scans, room))
             for effect in scans.handle(*came, now):
-                self._perform(one, effect)
+                self._perform(mailbox, effect)
             worker.stop.wait(min(time.thread_time() - began_s, MAX_REST_S))
-        self._end(one)
+        self._end(mailbox)
 
-    def _end(self, one: Drone) -> None:
+    def _end(self, mailbox: DroneMailbox) -> None:
         """Close the scans of a drone whose worker ends, or has ended by a fault."""
-        for effect in one.scans.close(time.monotonic()):
-            self._perform(one, effect)
+        for effect in mailbox.scans.close(time.monotonic()):
+            self._perform(mailbox, effect)
 
     # Effects
 
-    def _perform(self, one: Drone, effect: drone.Effect) -> None:
+    def _perform(self, mailbox: DroneMailbox, effect: drone.Effect) -> None:
         """Carry out what a drone's worker has decided; what follows is put into it. Without a
         session nothing is sent: what it was for is due again."""
         session, high = self._session, zenoh.Priority.INTERACTIVE_HIGH
         match effect:
             case drone.Write():
-                self._writes.put((effect, one))
+                self._writes.put((effect, mailbox))
             case drone.Opened(scan):
                 self._opened(scan)
             case drone.Put() | drone.Get() if session is not None:
                 try:
                     if isinstance(effect, drone.Get):
-                        self._ask(session, one, effect)
+                        self._ask(session, mailbox, effect)
                     else:
                         session.put(*effect, priority=high, congestion_control=DROP, express=True)
                 except zenoh.ZError as error:
                     log.debug("%s is not sent: %s", effect.key, error)
 
-    def _ask(self, session: zenoh.Session, one: Drone, request: drone.Get) -> None:
+    def _ask(self, session: zenoh.Session, mailbox: DroneMailbox, request: drone.Get) -> None:
         """Send a request. One beyond the drone's share is over at once, so that it is made again
         after a pause."""
-        one.requests = [taker for taker in one.requests if not taker.is_done]
-        if len(one.requests) >= self.limits.requests // max(1, len(self._busy)):
-            one.put(request.answered)
+        mailbox.requests = [taker for taker in mailbox.requests if not taker.is_done]
+        if len(mailbox.requests) >= self.limits.requests // max(1, len(self._busy)):
+            mailbox.put(request.answered)
             return
         replies = session.get(
             request.key,
@@ -387,8 +394,8 @@ class Receiver:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=ASK_TIMEOUT_S,
         )
-        answered = partial(one.put, request.answered)
-        one.requests.append(self._take_from("replies", replies, answered))
+        answered = partial(mailbox.put, request.answered)
+        mailbox.requests.append(self._take_from("replies", replies, answered))
 
     def _write_all(self, worker: Worker) -> None:
         """Write deliverables until the end: those asked for first, and between them what a former
@@ -401,8 +408,8 @@ class Receiver:
                 continue
             if asked is None:
                 return
-            effect, one = asked
+            effect, mailbox = asked
             trouble, is_due = write_files(effect.folder, self._deliver)
-            one.put(drone.Written(effect.scan, trouble, is_due))
+            mailbox.put(drone.Written(effect.scan, trouble, is_due))
             if effect.is_whole and not trouble:
                 guarded(f"end of {effect.folder}", partial(self._ended, effect.folder))

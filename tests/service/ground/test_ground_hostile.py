@@ -29,7 +29,7 @@ from service.ground.receiver import (
     MAX_HEADS,
     MAX_ITEM_BYTES,
     MAX_ITEMS,
-    Drone,
+    DroneMailbox,
     Receiver,
     ReceiverConfig,
 )
@@ -385,7 +385,7 @@ def test_a_scan_that_is_deleted_while_it_comes_in_is_received_anew(tmp_path: Pat
 
 
 def test_an_inbox_holds_no_more_than_its_bounds(tmp_path: Path) -> None:
-    inbox = Drone(DroneReceiver("red", tmp_path, "base", DroneLimits(), 0.0))
+    inbox = DroneMailbox(DroneReceiver("red", tmp_path, "base", DroneLimits(), 0.0))
     for k in range(MAX_HEADS):
         inbox.put_head(f"scan-{k}", b"first")
     assert inbox.dropped == 0
