@@ -37,7 +37,7 @@ from recon.types import U8
 from service.cameras import open_container, reject_options
 from service.cameras.access_units import LARGEST_BYTES, access_units
 from service.cameras.lens import same_shape
-from service.cameras.source import CameraFrame, CameraSource, Paced, frame_bgr
+from service.cameras.source import CameraFrame, CameraSource, QueuedSource, frame_bgr
 from service.cameras.video import decoded_frames, video_stream
 from service.errors import InputError, NoSenderError, OutsideError
 from service.redaction import without_credentials
@@ -382,7 +382,7 @@ def _live(
         )
         return made
 
-    return Paced(LiveSource(opened, without_credentials(url), config, listens))
+    return QueuedSource(LiveSource(opened, without_credentials(url), config, listens))
 
 
 TAIL = (
@@ -423,7 +423,7 @@ def _launched(
     def opened(stall_s: float) -> Any:
         return open_command(command, stall_s, demuxer, config.open_s)
 
-    return Paced(LiveSource(opened, description, config, listens))
+    return QueuedSource(LiveSource(opened, description, config, listens))
 
 
 OUTPUT_BYTES = 1 << 18  # read at once from a command: raw video is 40 MB/s

@@ -188,11 +188,12 @@ def _read(
 CLOSE_S = 5.0  # for a recording's reader to end
 
 
-class Paced(Relayed):
-    """A source that delivers each image at its presentation time, as a camera does.
+class QueuedSource(Relayed):
+    """A source whose newest images wait in a queue of ``kept``, filled on a separate thread; older
+    ones are dropped, as by GStreamer's ``queue leaky=downstream``, and :attr:`dropped` counts them.
 
-    A live source is not delayed: it is drained, so that its newest images are used.
-    At most ``kept`` images wait; :attr:`dropped` counts those that were not fetched in time.
+    A live source is read as fast as it gives images. Those of a recording come at their
+    presentation time, as a camera's do.
     """
 
     def __init__(self, source: CameraSource, kept: int = 2) -> None:
@@ -228,7 +229,7 @@ class Paced(Relayed):
         self._reader.join()  # it ends with its queue
         source = self._source.following()
         self._is_passed_on = source is not None
-        return source and Paced(source)
+        return source and QueuedSource(source)
 
     def close(self) -> None:
         """End the iteration at once, from any thread, and close the source.

@@ -70,7 +70,7 @@ def replay(
     with loading():
         from service.cameras import open_camera, parse_source
         from service.cameras.camera_file import load_camera
-        from service.cameras.source import Paced
+        from service.cameras.source import QueuedSource
         from service.commands.missing_metadata import (
             load_log,
             own_telemetry,
@@ -94,7 +94,7 @@ def replay(
     camera = load_camera(model) if model else None
     log = load_log(telemetry, chosen) if telemetry else own_telemetry(video, chosen)
     source = open_camera(video)
-    with closing(Paced(source) if realtime else source) as played:
+    with closing(QueuedSource(source) if realtime else source) as played:
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
         start, lens, notes = _lens(camera, source, log)

@@ -444,7 +444,7 @@ class Scanning:
     def _open_camera(self, run: ScanRun) -> CameraSource | None:
         """The camera at its own pace, retried until it answers; None when stopped meanwhile."""
         from service.cameras import open_camera
-        from service.cameras.source import Paced
+        from service.cameras.source import QueuedSource
 
         with self._lock:
             following = self._take_following()
@@ -456,7 +456,7 @@ class Scanning:
             try:
                 source = (self._opener or open_camera)(self.config.camera.source)
                 source.is_reshaped = self._is_reshaped
-                return source if isinstance(source, Paced) else Paced(source)
+                return source if isinstance(source, QueuedSource) else QueuedSource(source)
             except OutsideError as error:
                 log.warning("%s; trying again", error)
                 self.vehicle.statustext(f"Camera: {error}", WARNING, is_answer=is_answer)

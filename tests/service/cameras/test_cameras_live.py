@@ -31,7 +31,7 @@ from loopback import free_port, until
 from service.cameras import CameraFrame, CameraSource, live, open_camera
 from service.cameras.access_units import LONGEST_HEAD, SURE, access_units, headed
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
-from service.cameras.source import Paced
+from service.cameras.source import QueuedSource
 from service.cameras.video import decoded_frames, video_stream
 from service.errors import InputError, NoSenderError, OutsideError
 from service.workers import PROCESS, Worker
@@ -385,12 +385,12 @@ def test_a_shape_that_stays_is_another_sources() -> None:
     """The connection stays: a sender that is cut off may not come again."""
     config = replace(QUICK, changed_s=0.2)
     source = LiveSource(opener(clip(10), clip(200, (96, 64))), "test", config)
-    paced = Paced(source)
-    assert {frame.image.shape for frame in paced} == {(48, 64, 3)}
+    queued = QueuedSource(source)
+    assert {frame.image.shape for frame in queued} == {(48, 64, 3)}
     began_ns, losses = source.start_monotonic_ns, source.losses
-    following = paced.following()
+    following = queued.following()
     assert following is not None and following.is_live and following.is_reshaped
-    paced.close()
+    queued.close()
     assert (following.size_px, following.warnings) == ((96, 64), [])
     assert following.start_monotonic_ns is not None and began_ns is not None
     assert following.start_monotonic_ns > began_ns
@@ -419,12 +419,12 @@ def test_a_source_that_nothing_follows_is_closed() -> None:
         opened.append(RealTime(av.open(io.BytesIO(clip(5, (96, 64) if opened else (64, 48))))))
         return opened[-1]
 
-    paced = Paced(LiveSource(open_container, "test", replace(QUICK, changed_s=0.0)))
-    assert len(list(paced)) > 0
+    queued = QueuedSource(LiveSource(open_container, "test", replace(QUICK, changed_s=0.0)))
+    assert len(list(queued)) > 0
     assert [one.is_open for one in opened] == [False, True]
-    paced.close()
+    queued.close()
     assert not opened[-1].is_open
-    assert paced.following() is None
+    assert queued.following() is None
 
 
 def test_frozen_image_is_found_out() -> None:
@@ -439,26 +439,26 @@ def test_live_images_are_not_held_back() -> None:
     """A live source that was opened an hour before it is read gives its images at once."""
     source = LiveSource(opener(clip(5)), "test", QUICK)
     source._first = (source._first[0], 3600 * 10**9)
-    paces = Paced(source)
-    frame = next(iter(paces))
-    paces.close()
+    queued = QueuedSource(source)
+    frame = next(iter(queued))
+    queued.close()
     assert frame.time_ns == 3600 * 10**9
 
 
 def test_waiting_for_a_dead_camera_can_be_ended() -> None:
     source = LiveSource(opener(clip(6), OSError("gone")), "test", QUICK)
-    paces = Paced(source)
-    frames = iter(paces)
+    queued = QueuedSource(source)
+    frames = iter(queued)
     next(frames)
-    threading.Timer(0.5, paces.close).start()
+    threading.Timer(0.5, queued.close).start()
     assert len(list(frames)) < 6
-    paces.close()
+    queued.close()
 
 
 @pytest.mark.parametrize("taken", [0, 1, 5])
-@pytest.mark.parametrize("pace", [Paced, lambda source: source], ids=["paced", "direct"])
+@pytest.mark.parametrize("wrap", [QueuedSource, lambda source: source], ids=["queued", "direct"])
 def test_an_ended_stream_is_released_at_once(
-    pace: Callable[[CameraSource], CameraSource], taken: int, no_collector: None
+    wrap: Callable[[CameraSource], CameraSource], taken: int, no_collector: None
 ) -> None:
     """Its port or device must be free for the next scan, not when the collector comes round."""
     opened: list[RealTime] = []
@@ -467,7 +467,7 @@ def test_an_ended_stream_is_released_at_once(
         opened.append(opener(clip(500))(stall_s))
         return opened[-1]
 
-    source = pace(LiveSource(open_container, "test", QUICK))
+    source = wrap(LiveSource(open_container, "test", QUICK))
     for _ in itertools.islice(source, taken):
         pass
     assert len(opened) == 1
@@ -487,9 +487,9 @@ def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:
     """Its images are hours apart; closing does not wait for the next one."""
     path = tmp_path / "v.mkv"
     path.write_bytes(clip(3, step_s=Fraction(3600)))
-    paces = Paced(open_camera(str(path)))
-    threading.Timer(0.3, paces.close).start()
-    assert [frame.time_ns for frame in paces] == [0]
+    queued = QueuedSource(open_camera(str(path)))
+    threading.Timer(0.3, queued.close).start()
+    assert [frame.time_ns for frame in queued] == [0]
 
 
 def test_a_recording_is_not_closed_while_an_image_is_decoded(
@@ -522,11 +522,11 @@ def test_a_recording_is_not_closed_while_an_image_is_decoded(
 
     recording._is_wanted = slow  # type: ignore[attr-defined]
     recording.close = closed  # type: ignore[method-assign]
-    paces = Paced(recording)
-    reading = threading.Thread(target=lambda: list(paces))
+    queued = QueuedSource(recording)
+    reading = threading.Thread(target=lambda: list(queued))
     reading.start()
     assert decoding.wait(10.0)
-    paces.close()
+    queued.close()
     assert events[:2] == ["decoded", "closed"]
     reading.join(10.0)
     assert not reading.is_alive()

@@ -17,7 +17,7 @@ from onboard import FakeCamera, Onboard, camera_of
 
 from mavlink.component.control import Phase
 from service.cameras.live import LiveConfig, LiveSource
-from service.cameras.source import CameraFrame, Paced
+from service.cameras.source import CameraFrame, QueuedSource
 from service.daemon.frame_gate import FrameGate
 from service.daemon.resumption import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
@@ -82,10 +82,10 @@ def test_another_shape_of_a_live_stream_begins_another_scan(tmp_path: Path) -> N
     """The first scan ends as one whose recording has ended; the camera is not opened again."""
     opened: list[str] = []
 
-    def open_camera(source: str) -> Paced:
+    def open_camera(source: str) -> QueuedSource:
         opened.append(source)
         parts = clip(20, (320, 240)), clip(20, (320, 180)), clip(1000, (160, 90))
-        return Paced(LiveSource(opener(*parts), "gimbal", LiveConfig(changed_s=0.2)))
+        return QueuedSource(LiveSource(opener(*parts), "gimbal", LiveConfig(changed_s=0.2)))
 
     daemon = Onboard(tmp_path, "camera.source=srt://:9000", opener=open_camera)
     scanning, said = daemon.scanning, daemon.vehicle.said
@@ -117,9 +117,9 @@ def test_a_fault_after_another_shape_does_not_make_it_unfit(tmp_path: Path) -> N
     first, later = ((20, (320, 240)), (20, (320, 180))), ((1000, (320, 180)),)
     given = iter((first, later))
 
-    def open_camera(_: str) -> Paced:
+    def open_camera(_: str) -> QueuedSource:
         parts = (clip(*part) for part in next(given))
-        return Paced(LiveSource(opener(*parts), "gimbal", LiveConfig(changed_s=0.2)))
+        return QueuedSource(LiveSource(opener(*parts), "gimbal", LiveConfig(changed_s=0.2)))
 
     faults = iter((None, OutsideError("the disk is away")))
 
