@@ -11,7 +11,7 @@ import numpy as np
 from recon import se3
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.posegraph.pose_priors import dead_reckoned
-from recon.poses import carried
+from recon.posegraph.trajectory import carried
 from recon.tracking.frame import Frame, Tracking
 from recon.types import F64, Pose, PosePrior
 

@@ -20,8 +20,7 @@ from recon.posegraph.ground import MAX_LEVELLED_SHARE, height_above, height_belo
 from recon.posegraph.loop_closure import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Node
-from recon.posegraph.trajectory import Trajectory
-from recon.poses import carried
+from recon.posegraph.trajectory import Trajectory, carried
 from recon.stereo.reprojection import known_where
 from recon.types import F32, F64, Bool, DepthMap, Keyframe, Pose, Verdict
 

@@ -11,7 +11,6 @@ from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loop
-from recon.poses import sigma_m
 from recon.table import Rows, Table
 from recon.types import F64, I64, Bool, Pose
 
@@ -40,6 +39,18 @@ KEYFRAME = np.dtype(
     ]
 )
 """A row of the table: one keyframe."""
+
+
+def sigma_m(pose: Pose) -> float:
+    """Sigma of the place, in all three directions together."""
+    return se3.sigma_at(pose.T_world_camera[:3, 3], pose.covariance)
+
+
+def carried(pose: Pose, T_keyframe_camera: F64) -> Pose:
+    """A frame in the world by its pose (4, 4) relative to a keyframe, in units of the odometry."""
+    moved = T_keyframe_camera.copy()
+    moved[:3, 3] *= pose.scale
+    return replace(pose, T_world_camera=pose.T_world_camera @ moved)
 
 
 class Trajectory:

@@ -18,7 +18,7 @@ import numpy as np
 from mavlink.telemetry.samples import VehicleState
 from recon.pipeline.mapper import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.ground import GUESSED_SHARE
-from recon.poses import sigma_m
+from recon.posegraph.trajectory import sigma_m
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Keyframe, Pose
 from service.cameras.rig import Rig, attitude_of

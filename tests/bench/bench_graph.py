@@ -14,8 +14,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Loop, Node
-from recon.posegraph.trajectory import Trajectory
-from recon.poses import carried
+from recon.posegraph.trajectory import Trajectory, carried
 from recon.types import F64, Pose, PosePrior
 from service.bench import BenchOptions, BenchResult
 from service.config import FusionConfig

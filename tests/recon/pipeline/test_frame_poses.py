@@ -16,8 +16,7 @@ from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import untimed
 from recon.posegraph.alignment_readings import Alignment
-from recon.posegraph.trajectory import Trajectory
-from recon.poses import sigma_m
+from recon.posegraph.trajectory import Trajectory, sigma_m
 from recon.tracking.frame import NO_IMAGE, Frame, Tracking
 from recon.types import F64, Pose, PosePrior
 

@@ -11,8 +11,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph.records import Loop, Node
-from recon.posegraph.trajectory import REPOSE_M, REPOSE_SIGMAS, Trajectory
-from recon.poses import carried, sigma_m
+from recon.posegraph.trajectory import REPOSE_M, REPOSE_SIGMAS, Trajectory, carried, sigma_m
 from recon.types import F64, DepthMap, Keyframe, Pose, PosePrior
 from service.scans.fused_cloud import fused_cloud
 from service.stream import codec
