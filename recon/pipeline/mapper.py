@@ -22,8 +22,7 @@ from recon.calibration.focal_watch import FocalWatch
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.gain_compensation import GainCompensation
 from recon.mapping.voxel_map import VoxelMap, ground_sample_m
-from recon.pipeline.frame_poses import FramePoses
-from recon.pipeline.keyframe_map import KeyframeMap, SurfaceMap
+from recon.pipeline.keyframe_map import FramePoses, KeyframeMap, SurfaceMap
 from recon.pipeline.stages import (
     DenseStereo,
     Timing,

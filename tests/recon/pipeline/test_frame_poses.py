@@ -12,8 +12,7 @@ from some_views import keyframe_at, view_at
 
 from recon import se3
 from recon.backends.cpu import CpuBackend
-from recon.pipeline.frame_poses import FramePoses
-from recon.pipeline.keyframe_map import KeyframeMap
+from recon.pipeline.keyframe_map import FramePoses, KeyframeMap
 from recon.pipeline.stages import untimed
 from recon.posegraph.alignment_readings import Alignment
 from recon.posegraph.trajectory import Trajectory, sigma_m

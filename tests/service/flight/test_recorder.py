@@ -19,8 +19,7 @@ from mavlink.telemetry.samples import PositionSample
 from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.camera_model import scaled_K
-from recon.pipeline.frame_poses import FramePoses
-from recon.pipeline.keyframe_map import KeyframeMap
+from recon.pipeline.keyframe_map import FramePoses, KeyframeMap
 from recon.pipeline.mapper import FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.stages import untimed
 from recon.posegraph.alignment import Scale
