@@ -15,7 +15,7 @@ import numpy as np
 from recon import se3
 from recon.calibration.adjusted_track import AnyTrack
 from recon.camera_model import Undistorter
-from recon.motion_blur import ExposureTimeWatch
+from recon.image_quality import ExposureTimeWatch
 from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import depth_share
 from recon.row_errors import turn_shares

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.motion_blur import ExposureTimeWatch
+from recon.image_quality import ExposureTimeWatch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.sensor_offsets import Constants
 from recon.tracking.frame import Frame, Tracking

@@ -14,7 +14,7 @@ from tracked_frame import undistorted
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.motion_blur import ExposureTimeWatch, streak_px
+from recon.image_quality import ExposureTimeWatch, streak_px
 from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig

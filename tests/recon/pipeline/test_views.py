@@ -14,7 +14,7 @@ from some_views import keyframe_at
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.motion_blur import ExposureTimeWatch
+from recon.image_quality import ExposureTimeWatch
 from recon.pipeline.views import ViewSelection, VirtualStereoCamera
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.frame import Frame, Landmarks, Tracking
