@@ -69,9 +69,9 @@ def bounding_box(known: Bool) -> tuple[int, int, int, int]:
 
 def reduce(full: Planes, factor: int) -> Planes:
     """``full`` at 1/factor of its size; a block is known when a quarter of it is."""
-    from service.stream import plane_kernels
+    from service.stream import plane_coders
 
-    depth, sigma, views, bgr, known = plane_kernels.reduce(
+    depth, sigma, views, bgr, known = plane_coders.reduce(
         full.depth_m, full.sigma_m, full.views, full.bgr, full.known, factor, SPREAD
     )
     return Planes(depth, sigma, np.clip(views, 1, MAX_VIEWS), bgr, known)
@@ -174,11 +174,11 @@ def decode_views(data: bytes, w: int, h: int) -> U8 | None:
 
 def encode_colour(planes: Planes, quality: int) -> bytes:
     """The box as a JPEG; blocks without known pixels are flat and cost little."""
-    from service.stream import plane_kernels
+    from service.stream import plane_coders
 
     image = np.ascontiguousarray(planes.bgr)
     if not planes.known.all():
-        image = plane_kernels.calm(image, np.ascontiguousarray(planes.known), MCU_PX)
+        image = plane_coders.calm(image, np.ascontiguousarray(planes.known), MCU_PX)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     return cv2.imencode(".jpg", image, options)[1].tobytes()
 

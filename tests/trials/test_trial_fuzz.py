@@ -67,7 +67,7 @@ ATHERIS = """
 import atheris, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-compiled = ["plane_coders", "plane_kernels"]  # numba reads their bytecode
+compiled = ["plane_coders"]  # numba reads their bytecode
 kernels = [f"service.stream.{name}" for name in compiled]
 with atheris.instrument_imports(include=["service", "mavlink"], exclude=kernels):
     from trial_decoders import DECODERS

@@ -12,7 +12,7 @@ from spied import spied
 import service
 from service.commands import demo
 from service.errors import InputError
-from service.stream import plane_coders, plane_kernels
+from service.stream import plane_coders
 
 
 def make_flight(home: Path) -> Path:
@@ -38,7 +38,7 @@ def test_kernels_of_partly_new_keyframes_are_compiled_too(monkeypatch: pytest.Mo
     kernels = [
         spied(monkeypatch, module, name)
         for module, name in (
-            (plane_coders, "_encode_bits"), (plane_coders, "_decode_bits"), (plane_kernels, "calm"),
+            (plane_coders, "_encode_bits"), (plane_coders, "_decode_bits"), (plane_coders, "calm"),
         )
     ]  # fmt: skip
     demo.compile_kernels()
