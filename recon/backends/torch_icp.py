@@ -3,7 +3,7 @@
 Surfaces, partners, weights and steps stay on the device, for a fixed number of iterations; one
 that has settled stands still. Nothing is read in between, so on CUDA all of it is one captured
 graph. The verdict and the covariance are those of :mod:`recon.mapping.registration`, from the
-sums of one more iteration; surface elements are those of :mod:`recon.mapping.icp_kernels`.
+sums of one more iteration; surface elements are those of :mod:`recon.mapping.registration`.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _concluded(rows: F64, start: F64, config: IcpConfig) -> Registration:
 
 
 def area_of(lags: F64) -> float:
-    """How many neighbours err together, as :func:`recon.mapping.icp_kernels.correlated_area`."""
+    """How many neighbours err together, as :func:`recon.mapping.registration.correlated_area`."""
     area = 1.0
     for products, powers, counts in lags:
         length = 1.0

@@ -1,6 +1,6 @@
 """Projective ICP as Triton kernels: surface elements, and an iteration in four of them.
 
-``weigh`` matches every point, as :func:`recon.mapping.icp_kernels.residuals`, and writes its
+``weigh`` matches every point, as :func:`recon.mapping.registration.residuals`, and writes its
 residual; the scale of the residuals is their median; then the points are matched again,
 weighed, and summed up, a row of partial sums for a block of points. ``advance`` is one program: the
 directions that the surface determines, the step along them, and what has settled. All numbers are
@@ -19,12 +19,13 @@ import triton.language as tl
 from torch import Tensor
 
 from recon.backends.triton_dense import blocks
-from recon.mapping.icp_kernels import MIN_PIXELS, REACH
 from recon.mapping.registration import (
     EDGE_SHARE,
     GATE_SHARE,
     HUBER_SIGMAS,
     MIN_PARTNERS,
+    MIN_PIXELS,
+    REACH,
     TUKEY_SIGMAS,
     WEAK_SLOPE,
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.mapping import icp_kernels
+from recon.mapping import registration
 from recon.mapping.registration import DepthSurface, IcpConfig
 from recon.mapping.registration import register_projective as compiled
 from recon.types import F64, DepthMap, Registration
@@ -158,16 +158,16 @@ def test_residuals_that_err_together_are_counted_alike(device: str) -> None:
 
     rng = np.random.default_rng(0)
     none = np.zeros((20, 30))
-    assert icp_kernels.correlated_area(none.astype(np.float32), 1.0, 12) == 1.0
+    assert registration.correlated_area(none.astype(np.float32), 1.0, 12) == 1.0
     still = torch.from_numpy(none).to(device)
     assert area_of(correlation_sums(still, still == 0, 12).cpu().numpy()) == 1.0
     for blur in (0.0, 1.5, 3.0):
         field = rng.normal(0, 1, (60, 100))
         if blur:
             field = np.asarray(cv2.GaussianBlur(field, (0, 0), blur))
-        field[rng.random(field.shape) < 0.2] = float(icp_kernels.UNMATCHED)
+        field[rng.random(field.shape) < 0.2] = float(registration.UNMATCHED)
         limit = 2.0 * float(np.std(field[field < 10]))
-        want = icp_kernels.correlated_area(field.astype(np.float32), limit, 12)
+        want = registration.correlated_area(field.astype(np.float32), limit, 12)
         near = np.abs(field) < limit
         size, members = (torch.from_numpy(x).to(device) for x in (np.where(near, field, 0.0), near))
         lags = correlation_sums(size, members, 12).cpu().numpy()
