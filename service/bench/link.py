@@ -21,7 +21,7 @@ from service.bench import BenchOptions, BenchResult
 from service.bench.keyframes import make_keyframe, strip
 from service.bench.link_emulator import LinkEmulator, LinkModel
 from service.config import DatalinkConfig
-from service.ground.received import ReceivedScan
+from service.ground.drone import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.listener import free_ports
 from service.stream import codec

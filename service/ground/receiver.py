@@ -28,9 +28,9 @@ import zenoh
 
 from service.errors import InputError, SkyreliefError
 from service.ground import drone
+from service.ground.drone import ReceivedScan
 from service.ground.due import FILES, deliver, write_files
 from service.ground.front import behind_fronts
-from service.ground.received import ReceivedScan
 from service.ground.storage import DroneLimits
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session

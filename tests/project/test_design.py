@@ -9,7 +9,7 @@ from typing import get_args
 from paths import ROOT
 
 from service.daemon.scan_state import TRANSITIONS
-from service.ground import drone, received
+from service.ground import drone
 from service.workers import ROWS
 
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -39,7 +39,7 @@ def test_the_table_of_a_scan_s_states_is_the_code_s() -> None:
 
 def test_the_table_of_a_received_scan_s_files_is_the_code_s() -> None:
     table = ["| files | change > next |", "| --- | --- |"]
-    for state, row in received.TRANSITIONS.items():
+    for state, row in drone.TRANSITIONS.items():
         changes = ", ".join(f"{change.value} > {after.value}" for change, after in row.items())
         table.append(f"| {state.value} | {changes} |")
     assert "\n".join(["", *table, ""]) in TEXT

@@ -24,10 +24,13 @@ from hypothesis.stateful import (
 
 from service.ground.drone import (
     REWRITE_S,
+    TRANSITIONS,
     Answered,
+    Change,
     DroneReceiver,
     Effect,
     Event,
+    Files,
     Get,
     Item,
     Opened,
@@ -35,7 +38,6 @@ from service.ground.drone import (
     Write,
     Written,
 )
-from service.ground.received import TRANSITIONS, Change, Files
 from service.ground.storage import DroneLimits
 from service.stream import codec
 from service.stream.messages import Head, Held, pack, split, unpack

@@ -23,8 +23,7 @@ from loopback import free_port, until
 from paths import ROOT
 
 from service.config import DatalinkConfig
-from service.ground.drone import Answered, DroneReceiver, Item
-from service.ground.received import ReceivedScan
+from service.ground.drone import Answered, DroneReceiver, Item, ReceivedScan
 from service.ground.receiver import (
     MAX_HEADS,
     MAX_ITEM_BYTES,
