@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from service.config import DatalinkConfig
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.stream.database import Listener
 from service.stream.messages import Ask, Held, unpack
 from service.stream.naming import ROOT, check_name
 from service.stream.outbox import Outbox, Outgoing
-from service.stream.ranges import Listener, RangeSet, ranges_from_text
+from service.stream.ranges import RangeSet, ranges_from_text
 from service.stream.reports import TAKE_S, HeldNotes, Reports
 from service.stream.session import (
     SessionConfig,

@@ -11,9 +11,8 @@ import numpy as np
 from recon.camera_model import scaled_K
 from recon.types import DepthMap, Keyframe, Pose
 from service.stream import codec, planes
-from service.stream.database import Database, blob
+from service.stream.database import Database, blob, is_number
 from service.stream.radio_messages import CELLS, RadioTile, unpack_pose, unpack_tile
-from service.stream.ranges import is_number
 from service.stream.records import PoseRecord
 
 GRID_WIDTH_PX = 40

@@ -1,32 +1,19 @@
-"""Sets of item numbers as inclusive ranges, and the items of a store by kind, kept in memory."""
+"""Sets of item numbers as inclusive ranges."""
 
 from __future__ import annotations
 
 import re
-import zlib
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-
-from service.stream.codec import IMAGE_LAYER
-from service.stream.database import Database
 
 MAX_RANGES = 4096  # maximum ranges per message; the rest goes into the next message
 MAX_NUMBER = (1 << 32) - 1
 
 Pairs = list[tuple[int, int]]
-
-
-def is_number(column: str) -> str:
-    return f"typeof({column}) = 'integer' AND {column} BETWEEN 0 AND {MAX_NUMBER}"
-
-
-def chunk_kind(layer: int) -> str:
-    """The kind of item that the store holds as this layer of a keyframe."""
-    return "image" if layer == IMAGE_LAYER else f"k{layer}"
 
 
 class RangeSet:
@@ -146,95 +133,3 @@ def ranges_from_pairs(pairs: Any) -> RangeSet | None:
         if not all(type(n) is int and 0 <= n <= MAX_NUMBER for n in pair) or pair[0] > pair[1]:
             return None
     return RangeSet((a, b) for a, b in pairs)
-
-
-Listener = Callable[[str, int], None]
-
-_IN_FORCE = f"""
-SELECT id FROM reposes one WHERE {is_number("one.id")} AND NOT EXISTS (
-    SELECT 1 FROM reposes other WHERE other.seq = one.seq
-    AND (other.revision, other.id) > (one.revision, one.id))
-"""
-
-
-class Inventory:
-    """The numbers of the items of one scan; guarded by the database's lock.
-
-    Header and summary are numbered by the CRC-32 of their JSON, so that changes are visible.
-    Only the re-pose in force of each keyframe counts.
-    """
-
-    def __init__(self, database: Database) -> None:
-        self._lock = database.lock
-        self.listeners: list[Listener] = []
-        self._numbers: dict[str, RangeSet] = {}
-        self._reposes = RangeSet()  # stored, in force or not
-        self._database = database
-        self._version = database.version()[0]
-        self._load(database)
-
-    def follow(self) -> bool:
-        """Take in what other connections have written, if anything; listeners are not called."""
-        with self._lock:
-            before, self._version = self._version, self._database.version()[0]
-            if self._version == before:
-                return False
-            self._numbers.clear()
-            self._load(self._database)
-            return True
-
-    def _load(self, database: Database) -> None:
-        self._numbers["pose"] = _ids(database, "poses")
-        self._numbers["repose"] = RangeSet.of(row[0] for row in database.all(_IN_FORCE))
-        self._reposes = _ids(database, "reposes")
-        for kind in ("header", "summary"):
-            text = database.get(kind)
-            if text is not None:
-                self._numbers[kind] = RangeSet.of([zlib.crc32(text.encode())])
-        sql = f"SELECT seq, layer FROM chunks WHERE {is_number('seq')} ORDER BY layer, seq"
-        for seq, layer in database.all(sql):
-            if layer in range(IMAGE_LAYER + 1):
-                self._numbers.setdefault(chunk_kind(layer), RangeSet()).add(seq)
-
-    def all(self) -> dict[str, RangeSet]:
-        """Kind to numbers; kinds without any are left out."""
-        with self._lock:
-            return {kind: ranges.copy() for kind, ranges in self._numbers.items() if ranges}
-
-    def of(self, kind: str) -> RangeSet:
-        """The numbers of one kind; do not modify."""
-        return self._numbers.setdefault(kind, RangeSet())
-
-    def stored(self, kind: str) -> RangeSet:
-        """As :meth:`of`; with the re-poses that are no longer in force."""
-        return self._reposes if kind == "repose" else self.of(kind)
-
-    def note(self, kind: str, number: int) -> None:
-        self.of(kind).add(number)
-        self.tell(kind, number)
-
-    def tell(self, kind: str, number: int) -> None:
-        for listener in self.listeners:
-            listener(kind, number)
-
-    def note_whole(self, kind: str, data: bytes) -> None:
-        """Set a new header or summary, which replaces the previous one."""
-        self._numbers[kind] = RangeSet()
-        self.note(kind, zlib.crc32(data))
-
-    def note_repose(self, number: int, seq: int, revision: int) -> None:
-        """Add a stored re-pose; the highest revision, then the highest number, is in force."""
-        self._reposes.add(number)
-        sql = "SELECT revision, id FROM reposes WHERE seq = ? AND id != ? ORDER BY 1 DESC, 2 DESC"
-        before = self._database.one(f"{sql} LIMIT 1", (seq, number))
-        if before is not None:
-            if (before[0], before[1]) > (revision, number):
-                return
-            self.of("repose").discard(before[1])
-        self.note("repose", number)
-
-
-def _ids(database: Database, table: str) -> RangeSet:
-    return RangeSet.of(
-        row[0] for row in database.all(f"SELECT id FROM {table} WHERE {is_number('id')}")
-    )

@@ -24,9 +24,13 @@ from service.stream import codec
 from service.stream.database import (
     SCHEMA_VERSION,
     Database,
+    Inventory,
+    Listener,
     Statement,
     blob,
     can_write,
+    chunk_kind,
+    is_number,
     is_sound,
     json_object,
     json_value,
@@ -34,15 +38,7 @@ from service.stream.database import (
     rescue,
 )
 from service.stream.radio_tiles import RadioStore
-from service.stream.ranges import (
-    MAX_NUMBER,
-    Inventory,
-    Listener,
-    RangeSet,
-    chunk_kind,
-    is_number,
-    ranges_from_pairs,
-)
+from service.stream.ranges import MAX_NUMBER, RangeSet, ranges_from_pairs
 from service.stream.records import (
     PoseRecord,
     Repose,
