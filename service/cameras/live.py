@@ -37,8 +37,14 @@ from recon.types import U8
 from service.cameras import open_container, reject_options
 from service.cameras.access_units import LARGEST_BYTES, access_units
 from service.cameras.lens import same_shape
-from service.cameras.source import CameraFrame, CameraSource, QueuedSource, frame_bgr
-from service.cameras.video import decoded_frames, video_stream
+from service.cameras.source import (
+    CameraFrame,
+    CameraSource,
+    QueuedSource,
+    decoded_frames,
+    frame_bgr,
+    video_stream,
+)
 from service.errors import InputError, NoSenderError, OutsideError
 from service.redaction import without_credentials
 from service.workers import PROCESS, Worker, end_process, open_process

@@ -1,5 +1,5 @@
-"""The interface of all cameras: images with a time and their tags; and readers that fetch them on
-a separate thread."""
+"""The interface of all cameras: images with a time and their tags; how a stream becomes images, and
+readers that fetch them on a separate thread."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from threading import Event, Lock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from service.workers import PROCESS, Worker
 
 if TYPE_CHECKING:
     import av
+    import av.container
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +68,71 @@ def frame_bgr(frame: av.VideoFrame) -> U8:
     # Without a number of threads each image would start as many as there are cores.
     frame = VideoReformatter().reformat(frame, format="bgr24", threads=1)
     return np.ascontiguousarray(frame.to_ndarray(), dtype=np.uint8)
+
+
+MAX_PIXELS = 1 << 27
+"""Maximum pixels of an image; the decoder refuses larger ones before allocating memory."""
+
+MAX_ONE_CORE_PX = 1920 * 1088
+"""Pixels of the largest images that one core surely decodes as fast as cameras send them."""
+
+
+def video_stream(
+    container: av.container.InputContainer, is_live: bool = False
+) -> av.VideoStream | None:
+    """The first video stream, ready to decode; None without a decodable one.
+
+    An ``is_live`` one of up to :data:`MAX_ONE_CORE_PX` is decoded image by image: threads that
+    decode one image each hold back as many images as there are cores.
+    """
+    stream = container.streams.video[0] if container.streams.video else None
+    if stream is None or stream.codec_context is None:
+        return None
+    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+    px = stream.codec_context.width * stream.codec_context.height
+    stream.thread_type = "SLICE" if is_live and px <= MAX_ONE_CORE_PX else "AUTO"
+    return stream
+
+
+def decoded_frames(
+    packets: Iterator[av.Packet[Any]],
+    stream: av.VideoStream,
+    broke_off: Callable[[str], None],
+    damaged: Callable[[Exception], None],
+    is_needed: Callable[[av.Packet[Any]], bool] = lambda packet: True,
+) -> Iterator[av.VideoFrame]:
+    """Every complete image of ``packets`` of ``stream``: a damaged one affects no other.
+
+    ``broke_off`` is called when they end with an error, ``damaged`` for each image
+    that does not decode or that the decoder concealed. Packets that are not ``is_needed`` are
+    passed over.
+    """
+    import av.error
+
+    while True:
+        try:
+            packet = next(packets, None)
+        except IndexError:  # PyAV's, at the end of a recording in which a stream began late
+            packet = None
+        except (av.error.FFmpegError, OSError) as error:
+            broke_off(f"it is cut off: {error}")
+            packet = None
+        if packet is not None and not is_needed(packet):
+            continue
+        try:
+            frames = stream.codec_context.decode(None) if packet is None else packet.decode()
+        except av.error.EOFError:
+            frames = []  # the decoder was emptied before
+        except av.error.FFmpegError as error:
+            damaged(error)
+            frames = []
+        for frame in frames:
+            if frame.is_corrupt:
+                damaged(ValueError("concealed by the decoder"))
+            else:
+                yield frame
+        if packet is None:
+            return
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from mavlink.telemetry.samples import YEAR_2000_UNIX_S
 from service.cameras import UNREAD, how_to_convert, open_container, reject_options
-from service.cameras.source import CameraFrame, CameraSource, Decoded
+from service.cameras.source import CameraFrame, CameraSource, Decoded, decoded_frames, video_stream
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     import av.container
 
 log = logging.getLogger(__name__)
-
-MAX_PIXELS = 1 << 27
-"""Maximum pixels of an image; the decoder refuses larger ones before allocating memory."""
 
 OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 
@@ -214,68 +211,6 @@ class VideoSource(CameraSource):
                 f"{decoded} of the {self.images} images in the index could be "
                 "decoded; the recording is cut off or damaged"
             )
-
-
-MAX_ONE_CORE_PX = 1920 * 1088
-"""Pixels of the largest images that one core surely decodes as fast as cameras send them."""
-
-
-def video_stream(
-    container: av.container.InputContainer, is_live: bool = False
-) -> av.VideoStream | None:
-    """The first video stream, ready to decode; None without a decodable one.
-
-    An ``is_live`` one of up to :data:`MAX_ONE_CORE_PX` is decoded image by image: threads that
-    decode one image each hold back as many images as there are cores.
-    """
-    stream = container.streams.video[0] if container.streams.video else None
-    if stream is None or stream.codec_context is None:
-        return None
-    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
-    px = stream.codec_context.width * stream.codec_context.height
-    stream.thread_type = "SLICE" if is_live and px <= MAX_ONE_CORE_PX else "AUTO"
-    return stream
-
-
-def decoded_frames(
-    packets: Iterator[av.Packet[Any]],
-    stream: av.VideoStream,
-    broke_off: Callable[[str], None],
-    damaged: Callable[[Exception], None],
-    is_needed: Callable[[av.Packet[Any]], bool] = lambda packet: True,
-) -> Iterator[av.VideoFrame]:
-    """Every complete image of ``packets`` of ``stream``: a damaged one affects no other.
-
-    ``broke_off`` is called when they end with an error, ``damaged`` for each image
-    that does not decode or that the decoder concealed. Packets that are not ``is_needed`` are
-    passed over.
-    """
-    import av.error
-
-    while True:
-        try:
-            packet = next(packets, None)
-        except IndexError:  # PyAV's, at the end of a recording in which a stream began late
-            packet = None
-        except (av.error.FFmpegError, OSError) as error:
-            broke_off(f"it is cut off: {error}")
-            packet = None
-        if packet is not None and not is_needed(packet):
-            continue
-        try:
-            frames = stream.codec_context.decode(None) if packet is None else packet.decode()
-        except av.error.EOFError:
-            frames = []  # the decoder was emptied before
-        except av.error.FFmpegError as error:
-            damaged(error)
-            frames = []
-        for frame in frames:
-            if frame.is_corrupt:
-                damaged(ValueError("concealed by the decoder"))
-            else:
-                yield frame
-        if packet is None:
-            return
 
 
 LONGEST_CUE = 8192  # bytes of a cue that are read; drones write a few hundred

@@ -29,11 +29,10 @@ from service.cameras import (
     parse_source,
     video,
 )
-from service.cameras.source import Decoded
+from service.cameras.source import Decoded, decoded_frames
 from service.cameras.video import (
     PipeReader,
     VideoSource,
-    decoded_frames,
     index_at_end,
     parse_time_unix_ns,
 )

@@ -31,8 +31,7 @@ from loopback import free_port, until
 from service.cameras import CameraFrame, CameraSource, live, open_camera
 from service.cameras.access_units import LONGEST_HEAD, SURE, access_units, headed
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
-from service.cameras.source import QueuedSource
-from service.cameras.video import decoded_frames, video_stream
+from service.cameras.source import QueuedSource, decoded_frames, video_stream
 from service.errors import InputError, NoSenderError, OutsideError
 from service.workers import PROCESS, Worker
 

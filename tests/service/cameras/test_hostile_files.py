@@ -18,7 +18,8 @@ import pytest
 from PIL import Image
 
 from mavlink.telemetry.logs import load_telemetry
-from service.cameras import open_camera, video
+from service.cameras import open_camera
+from service.cameras import source as source_module
 from service.cameras.camera_file import load_camera
 from service.config import load_config
 from service.errors import InputError
@@ -95,7 +96,7 @@ def test_a_image_of_more_pixels_than_allowed_is_not_decoded(
 ) -> None:
     (tmp_path / "v.mp4").write_bytes(mp4)
     assert frames(tmp_path / "v.mp4") == 8
-    monkeypatch.setattr(video, "MAX_PIXELS", 96 * 64 - 1)
+    monkeypatch.setattr(source_module, "MAX_PIXELS", 96 * 64 - 1)
     assert frames(tmp_path / "v.mp4") == -1
 
 
