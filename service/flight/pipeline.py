@@ -24,8 +24,8 @@ from service.stream.outbox import FIRST_BYTES_S
 MAX_WAITING = 3  # views that wait for reconstruction
 
 
-def counts(view: StereoView) -> bool:
-    """False for a view that comes again: it is not lost when its first depth is."""
+def is_lost_if_dropped(view: StereoView) -> bool:
+    """False for a first depth, as its view comes again."""
     return not view.is_first_depth
 
 
@@ -105,7 +105,11 @@ class Pipeline:
         self, rows: tuple[str, str] | None, live: bool, work: Reconstruct
     ) -> BackgroundWorker[StereoView, Reconstructed]:
         self.worker = BackgroundWorker(
-            rows, lambda view: partial(self._watched, work(view)), MAX_WAITING, live, counts
+            rows,
+            lambda view: partial(self._watched, work(view)),
+            MAX_WAITING,
+            live,
+            is_lost_if_dropped,
         )
         return self.worker
 

@@ -1,4 +1,4 @@
-"""One scan from first frame to closed folder: a camera, the pipeline, the store, the link."""
+"""One scan, from the first frame of a camera to the closed folder: mapper, telemetry and store."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from recon.pipeline.mapper import Mapper
 from recon.pipeline.views import StereoView, VirtualStereoCamera
 from recon.types import Camera
 from service.background import BackgroundWorker
-from service.flight.pipeline import counts
+from service.flight.pipeline import is_lost_if_dropped
 
 ROWS = "dense", "placing"
 
@@ -130,7 +130,7 @@ def test_a_first_depth_that_gives_way_is_no_lost_view() -> None:
     def work(view: StereoView) -> None:
         gate.wait(5)
 
-    jobs = BackgroundWorker(ROWS, halves(work), 2, live=True, counts=counts)
+    jobs = BackgroundWorker(ROWS, halves(work), 2, live=True, counts=is_lost_if_dropped)
     views = [view_at(seq, np.eye(4)) for seq in range(4)]
     first = replace(views[2], is_first_depth=True)
     for view in (views[0], first, *views[1:3]):  # no more than the queue takes but for the first
