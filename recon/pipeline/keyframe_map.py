@@ -90,7 +90,7 @@ class KeyframeMap:
         return self.trajectory.pose(view.seq)
 
     def publish(self, seq: int, pose: Pose) -> bool:
-        """Whether a keyframe's pose can be given out; not where it is impossibly far away."""
+        """Note a keyframe's pose as published; False for one impossibly far away, which is not."""
         if not np.abs(pose.T_world_camera[:3, 3]).max() < FARTHEST_M:
             self._rejected["placed impossibly far away"] += 1
             return False
