@@ -42,7 +42,8 @@ def test_what_is_mirrored_is_filled_alike() -> None:
     fixed = np.hypot(ROWS - 90, COLS - 130) > 50
     found = between(height, fixed, ~fixed, CELL_M)
     for axes in (0, 1):
-        other = between(*(np.flip(a, axes).copy() for a in (height, fixed, ~fixed)), CELL_M)
+        turned, known = np.flip(height, axes).copy(), np.flip(fixed, axes).copy()
+        other = between(turned, known, ~known, CELL_M)
         np.testing.assert_allclose(np.flip(other, axes), found, atol=0.05)  # ties of the nearest
 
 
