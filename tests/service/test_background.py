@@ -198,18 +198,20 @@ def test_without_a_thread_the_work_is_done_at_once() -> None:
 
 
 def test_a_worker_that_is_not_closed_ends_with_its_owner() -> None:
+    before = set(threading.enumerate())  # other tests may have left some
     jobs = BackgroundWorker(ROWS, halves(str), 2)
     jobs.offer(1)
     assert jobs.finished(everything=True) == [(1, "1")]
-    assert {t.name for t in threading.enumerate()}.issuperset(ROWS)
+    assert {t.name for t in set(threading.enumerate()) - before}.issuperset(ROWS)
     del jobs
-    assert until(lambda: not any(t.name in ROWS for t in threading.enumerate()))
+    assert until(lambda: set(threading.enumerate()) <= before)
 
 
 def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
     def work(n: int) -> int:
         raise RuntimeError("no luck")
 
+    before = set(threading.enumerate())
     jobs: list[BackgroundWorker[int, int]] = []
 
     def worker(_: object) -> Any:
@@ -220,7 +222,7 @@ def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
     mapper.views = Mock(VirtualStereoCamera, **{"ready.return_value": [1, 2, 3]})
     with pytest.raises(RuntimeError, match="no luck"):
         mapper.finish()
-    assert not any(t.name in ROWS for t in threading.enumerate())
+    assert jobs and set(threading.enumerate()) <= before
 
 
 def test_after_an_end_nothing_waits_for_work_that_lasts() -> None:
