@@ -497,23 +497,31 @@ def _turned(q_wxyz: F32, v: F32) -> F32:
 def _lattice(vertices: F64, faces: I32, step_m: float) -> tuple[I64, F32]:
     """Places on triangles at most ``step_m`` apart: the triangle (N,) of each and its corners'
     weights (N, 3)."""
-    sides = np.empty(len(faces), np.int64)
-    for f in range(len(faces)):
-        longest = 0.0
-        for k in range(3):
-            one, other = vertices[faces[f, k]], vertices[faces[f, (k + 1) % 3]]
-            longest = max(longest, np.sqrt(np.sum((one - other) ** 2)))
-        sides[f] = int(np.ceil(max(longest / step_m, 1.0)))
-    total = np.sum(sides * (sides + 1) // 2)
-    face, weights, at = np.empty(total, np.int64), np.empty((total, 3), np.float32), 0
-    for f in range(len(faces)):
-        for i in range(sides[f]):
-            for j in range(sides[f] - i):
-                face[at] = f
-                weights[at, 0] = (i + 1.0 / 3.0) / sides[f]
-                weights[at, 1] = (j + 1.0 / 3.0) / sides[f]
-                weights[at, 2] = 1.0 - weights[at, 0] - weights[at, 1]
-                at += 1
+    total = 0
+    face, weights = np.empty(0, np.int64), np.empty((0, 3), np.float32)
+    for turn in range(2):  # count, then fill
+        if turn == 1:
+            face, weights, total = np.empty(total, np.int64), np.empty((total, 3), np.float32), 0
+        for f in range(len(faces)):
+            longest, first = -1.0, 0
+            for k in range(3):
+                side = vertices[faces[f, (k + 1) % 3]] - vertices[faces[f, k]]
+                length = np.sqrt(np.sum(side * side))
+                if length > longest:
+                    longest, first = length, k
+            one, other = vertices[faces[f, first]], vertices[faces[f, (first + 1) % 3]]
+            top = vertices[faces[f, (first + 2) % 3]]
+            high = np.sqrt(np.sum(np.cross(other - one, top - one) ** 2)) / max(longest, 1e-9)
+            rows = max(int(np.ceil(high / step_m)), 1)
+            for i in range(rows):  # from the longest side to the corner opposite
+                up = (i + 0.5) / rows
+                cols = max(int(np.ceil((1.0 - up) * longest / step_m)), 1)
+                for j in range(cols if turn == 1 else 0):
+                    face[total + j] = f
+                    weights[total + j, first] = (1.0 - up) * (1.0 - (j + 0.5) / cols)
+                    weights[total + j, (first + 1) % 3] = (1.0 - up) * (j + 0.5) / cols
+                    weights[total + j, (first + 2) % 3] = up
+                total += cols
     return face, weights
 
 
