@@ -26,7 +26,7 @@ SSIM_SHARE = 0.2
 SSIM_PX, SSIM_C1, SSIM_C2 = 11, 0.01**2, 0.03**2
 """Window and constants (Wang et al. 2004, doi:10.1109/TIP.2003.819861)."""
 
-MOST_OPACITY = 0.999
+MAX_TRAINED = 0.999
 """A viewer's logit of 1 is infinite."""
 
 Draw = Callable[..., tuple[Any, Any, Any]]
@@ -103,7 +103,7 @@ def trained(
         array(xyz + reach * free["offset"]),
         array(q),
         array(free["log_sigma"].exp()),
-        array(free["logit"].sigmoid().clamp(max=MOST_OPACITY)),
+        array(free["logit"].sigmoid().clamp(max=MAX_TRAINED)),
         array(255.0 * free["rgb"].clamp(0.0, 1.0)),
     )
 
