@@ -90,7 +90,7 @@ def trained(
         )
         is_there = tensor(view.bgra[..., 3:] > 0)
         wanted = tensor(view.bgra[..., 2::-1] / 255.0)
-        loss = _difference(image[0] * is_there, wanted * is_there)
+        loss = difference(image[0] * is_there, wanted * is_there)
         adam.zero_grad()
         loss.backward()
         adam.step()
@@ -108,12 +108,12 @@ def trained(
     )
 
 
-def _difference(image: Any, wanted: Any) -> Any:
-    """The loss of two images (h, w, 3) of 0 to 1."""
+def difference(image: Any, wanted: Any) -> Any:
+    """The loss of two images (h, w, 3) of 0 to 1, at least SSIM_PX wide and high."""
     from torch.nn.functional import avg_pool2d
 
     def mean(values: Any) -> Any:
-        return avg_pool2d(values.permute(2, 0, 1)[None], SSIM_PX, 1, SSIM_PX // 2)
+        return avg_pool2d(values.permute(2, 0, 1)[None], SSIM_PX, 1)
 
     a, b = mean(image), mean(wanted)
     aa, bb, ab = mean(image**2) - a**2, mean(wanted**2) - b**2, mean(image * wanted) - a * b

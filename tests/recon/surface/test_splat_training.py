@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.surface.splat_training import trained
+from recon.surface.splat_training import difference, trained
 from recon.surface.splats import Splats, rendered
 from recon.surface.texture_views import TextureView
 from recon.types import U8
@@ -117,6 +117,19 @@ def test_training_takes_gaussians_back_to_what_the_images_show(what: str) -> Non
     assert len(after) == len(true) and after.opacity.max() < 1.0
     np.testing.assert_allclose(np.linalg.norm(after.q_wxyz, axis=1), 1.0, atol=1e-5)
     assert after.rgb.min() >= 0.0 and after.rgb.max() <= 255.0
+
+
+def test_the_loss_is_that_of_kerbl_with_the_ssim_of_scikit_image() -> None:
+    metrics = pytest.importorskip("skimage.metrics", exc_type=ImportError)
+    rng = np.random.default_rng(5)
+    one = rng.uniform(0.0, 1.0, (H, W, 3))
+    other = np.clip(0.7 * one + rng.normal(0.1, 0.1, one.shape), 0.0, 1.0)
+    ssim = metrics.structural_similarity(
+        one, other, win_size=11, channel_axis=2, data_range=1.0, use_sample_covariance=False,
+        full=True,
+    )[1][5:-5, 5:-5].mean()  # fmt: skip
+    found = float(difference(torch.from_numpy(one), torch.from_numpy(other)))
+    assert found == pytest.approx(0.8 * np.abs(one - other).mean() + 0.2 * (1.0 - ssim), rel=1e-6)
 
 
 def test_what_an_image_does_not_hold_is_not_trained() -> None:
