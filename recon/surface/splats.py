@@ -443,7 +443,7 @@ def _on_bare(splats: Splats, mesh: Mesh, footprint_m: float) -> Splats:
     if mesh.rgb is None or not len(splats):
         return splats.at(np.zeros(0, np.int64))
     step_m = BARE_PX * footprint_m
-    number, keys = _cells(np.concatenate([splats.xyz_m, *_ends(splats, step_m)]), step_m)
+    number, keys = _cells(np.concatenate([splats.xyz_m, *_spread_over(splats, step_m)]), step_m)
     corners = mesh.vertices_m[mesh.faces]
     a, b, c = np.moveaxis(corners, 1, 0)
     up = np.cross(b - a, c - a)
@@ -475,15 +475,15 @@ def _on_bare(splats: Splats, mesh: Mesh, footprint_m: float) -> Splats:
     )  # fmt: skip
 
 
-def _ends(splats: Splats, cell_m: float) -> list[F32]:
-    """Places (N, 3) one sigma from the middles of Gaussians that are wider than such a cell."""
-    large = splats.at(2.0 * splats.sigma_m[:, :2].max(axis=1) > cell_m)
+def _spread_over(splats: Splats, cell_m: float) -> list[F32]:
+    """Places (N, 3) all over Gaussians that are wider than such a cell, to one sigma."""
+    widest = splats.sigma_m[:, :2].max(axis=1)
     out = []
-    for axis in (0, 1):
-        across = np.zeros_like(large.sigma_m)
-        across[:, axis] = large.sigma_m[:, axis]
-        offset = _turned(large.q_wxyz, across)
-        out += [large.xyz_m + offset, large.xyz_m - offset]
+    for few, some in ((1, (2.0 * widest > cell_m) & (widest <= cell_m)), (2, widest > cell_m)):
+        large, ways = splats.at(some), np.arange(-few, few + 1) / few
+        for side in ((i, j, 0.0) for i in ways for j in ways if i or j):
+            offset = large.sigma_m * np.array(side, np.float32)
+            out.append(large.xyz_m + _turned(large.q_wxyz, offset))
     return out
 
 

@@ -228,6 +228,23 @@ def test_a_wall_that_no_image_shows_is_closed_in_colours_that_run_on() -> None:
     assert (shown >= COVERED).all() and (before < COVERED).mean() > 0.8
 
 
+def test_a_surface_under_wide_gaussians_gets_no_more_of_them() -> None:
+    up = np.array([0.3, 0.2, 1.0]) / np.linalg.norm([0.3, 0.2, 1.0])
+    depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), up)
+    one, view = keyframe(0, depth), painted(depth)
+    view.bgra[..., :3] = 60
+    x, y = np.array([[-5.0, -5.0], [5.0, -5.0], [5.0, 5.0], [-5.0, 5.0]]).T
+    corners = np.column_stack([x, y, -(up[0] * x + up[1] * y) / up[2]])
+    rgb: U8 = np.full((4, 3), 200, np.uint8)
+    plane = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), rgb=rgb)
+    coloured, plain = (
+        len(splats_of([one], [view], lambda s=s: s, detail_levels=4))  # type: ignore[misc]
+        for s in (plane, replace(plane, rgb=None))
+    )
+    assert plain <= coloured < plain + 9  # at its border
+    assert coloured < 0.15 * SIZE[0] * SIZE[1]  # squares of up to eight pixels
+
+
 def test_flat_areas_have_few_gaussians_and_edges_all() -> None:
     """A view whose right half is of one colour, on a ground with a step; the left half is waves."""
     depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
