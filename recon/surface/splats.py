@@ -52,7 +52,8 @@ MERGED = 1.0
 
 BARE_PX, BEHIND, THIN = 3.0, 3, 0.2
 """Where the closed surface has no Gaussian in a cell of so many footprints, nor in so many in front
-and behind, where noise has put it, it gets one, of so much of its width across the surface."""
+and behind, where noise has put it, it gets some half a cell apart, as wide as half a cell to each
+side and of so much of that across the surface."""
 
 MAX_OPACITY, SINGLE = 0.95, 0.85
 """Opacity of what many views, and of what one view or none has measured."""
@@ -448,7 +449,7 @@ def _on_bare(splats: Splats, mesh: Mesh, footprint_m: float) -> Splats:
     a, b, c = np.moveaxis(corners, 1, 0)
     up = np.cross(b - a, c - a)
     up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
-    face, weights = _lattice(mesh.vertices_m, mesh.faces, step_m)
+    face, weights = _lattice(mesh.vertices_m, mesh.faces, 0.5 * step_m)
     places = np.einsum("nk,nkd->nd", weights, corners[face]).astype(np.float32)
     cell = _cell_along(places, up[face].astype(np.float32), keys, step_m)
     # A vertex has the colours of the Gaussians around it, in the cells that they lie in.
