@@ -189,9 +189,8 @@ class ExposureTimeWatch:
 
     def __init__(self) -> None:
         self._streaks: deque[tuple[float, float]] = deque(maxlen=STREAKS)  # px, px/s
-        self._over_motion: deque[float] = deque(
-            maxlen=STREAKS
-        )  # streak over that of an open shutter
+        # Each streak over that of a shutter that is always open.
+        self._over_motion: deque[float] = deque(maxlen=STREAKS)
         self.exposure_s: float | None = None  # by the images; None while too few show it
         self.shown_s = 0.0  # the exposure where it smears the images; 0: as sharp as others
         self.blur_px = 0.0  # median streak of the last keyframes; 0 where it does no harm

@@ -449,9 +449,15 @@ def _on_bare(splats: Splats, mesh: Mesh, footprint_m: float) -> Splats:
     a, b, c = np.moveaxis(corners, 1, 0)
     up = np.cross(b - a, c - a)
     up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
-    face, weights = _lattice(mesh.vertices_m, mesh.faces, 0.5 * step_m)
-    places = np.einsum("nk,nkd->nd", weights, corners[face]).astype(np.float32)
-    cell = _cell_along(places, up[face].astype(np.float32), keys, step_m)
+
+    def look(faces: I64, apart_m: float) -> tuple[I64, F32, F32, I32]:
+        """Triangles, corners' weights, places and cells next to these of a lattice on ``faces``."""
+        row, weights = _lattice(mesh.vertices_m, mesh.faces[faces], apart_m)
+        face = faces[row]
+        places = np.einsum("nk,nkd->nd", weights, corners[face]).astype(np.float32)
+        return face, weights, places, _cell_along(places, up[face].astype(np.float32), keys, step_m)
+
+    face, weights, _, cell = look(np.arange(len(mesh.faces)), step_m)
     # A vertex has the colours of the Gaussians around it, in the cells that they lie in.
     number, met = number[: len(splats)], np.flatnonzero(cell >= 0)
     corner, share = mesh.faces[face[met]].ravel(), weights[met].ravel()
@@ -463,6 +469,7 @@ def _on_bare(splats: Splats, mesh: Mesh, footprint_m: float) -> Splats:
         mean = np.bincount(number, splats.rgb[:, k], len(keys)) / np.maximum(count, 1)
         sums = np.bincount(corner, share * np.repeat(mean[cell[met]], 3), len(total))
         colour[is_seen, k] = sums[is_seen] / total[is_seen]
+    face, weights, places, cell = look(np.unique(face[cell < 0]), 0.5 * step_m)
     bare = np.flatnonzero(cell < 0)
     face, weights = face[bare], weights[bare]
     rgb = between_seen(mesh.faces, colour, is_seen)[mesh.faces[face]].astype(np.float32)
@@ -533,10 +540,7 @@ def _cell_along(places: F32, up: F32, cells: I64, cell_m: float) -> I32:
     size = 16
     while size < 2 * len(cells):
         size *= 2
-    keys, ids = np.full(size, -1, np.int64), np.zeros(size, np.int32)
-    for n in range(len(cells)):
-        slot = find_slot(keys, cells[n])
-        keys[slot], ids[slot] = cells[n], n
+    keys, ids = rehash(cells, np.arange(len(cells)).astype(np.int32), size)
     out = np.full(len(places), -1, np.int32)
     for n in range(len(places)):
         for m in range(4 * BEHIND + 1):
@@ -597,7 +601,8 @@ def rendered(
     w, h = size_px
     _, flat = _projected(splats, K, size_px, T_world_camera)
     image = np.empty((h, w, 4), np.float32)
-    _draw(flat, *_tiled(flat, w, h), image)
+    first, items, _ = _tiled(flat, w, h)
+    _draw(flat, first, items, image)
     return image[..., :3], 1.0 - image[..., 3]
 
 
@@ -811,17 +816,27 @@ def _blend(
 
 
 @njit(cache=True, nogil=True)
-def _draw(flat: F32, first: I64, items: I32, most: int, image: F32) -> None:
+def _draw_tile(
+    flat: F32, first: I64, items: I32, tile: int, h: int, w: int, light: F32, shares: F32
+) -> tuple[I32, int, int, int, int]:  # fmt: skip
+    """Draw one tile of an image (h, w), as :func:`_blend`; its Gaussians, now from the nearest on,
+    its first row and column, and how many rows and columns it has."""
+    across = -(-w // TILE_PX)
+    top, left = tile // across * TILE_PX, tile % across * TILE_PX
+    rows, cols = min(TILE_PX, h - top), min(TILE_PX, w - left)
+    some = items[first[tile] : first[tile + 1]]
+    _sort(flat, some)
+    _blend(flat, some, top, left, rows, cols, light, shares)
+    return some, top, left, rows, cols
+
+
+@njit(cache=True, nogil=True)
+def _draw(flat: F32, first: I64, items: I32, image: F32) -> None:
     """Fill ``image`` (h, w, 4): colours over black and the share of light from behind."""
     h, w = image.shape[:2]
     light, none = np.empty((TILE_PX * TILE_PX, 4), np.float32), np.empty(0, np.float32)
-    across = -(-w // TILE_PX)
     for tile in range(len(first) - 1):
-        top, left = tile // across * TILE_PX, tile % across * TILE_PX
-        rows, cols = min(TILE_PX, h - top), min(TILE_PX, w - left)
-        some = items[first[tile] : first[tile + 1]]
-        _sort(flat, some)
-        _blend(flat, some, top, left, rows, cols, light, none)
+        _, top, left, rows, cols = _draw_tile(flat, first, items, tile, h, w, light, none)
         for row in range(rows):
             for col in range(cols):
                 image[top + row, left + col] = light[row * TILE_PX + col]
@@ -834,13 +849,8 @@ def _errors(flat: F32, first: I64, items: I32, most: int, bgra: U8) -> F32:
     h, w = bgra.shape[:2]
     light = np.empty((TILE_PX * TILE_PX, 4), np.float32)
     shares, sums = np.empty(max(most, 1), np.float32), np.zeros((len(flat), 4), np.float32)
-    across = -(-w // TILE_PX)
     for tile in range(len(first) - 1):
-        top, left = tile // across * TILE_PX, tile % across * TILE_PX
-        rows, cols = min(TILE_PX, h - top), min(TILE_PX, w - left)
-        some = items[first[tile] : first[tile + 1]]
-        _sort(flat, some)
-        _blend(flat, some, top, left, rows, cols, light, shares)
+        some, top, left, rows, cols = _draw_tile(flat, first, items, tile, h, w, light, shares)
         for row in range(rows):
             for col in range(cols):
                 p = row * TILE_PX + col

@@ -1,4 +1,4 @@
-"""What a scan's header says of its place."""
+"""A scan's place, by its header."""
 
 from __future__ import annotations
 
